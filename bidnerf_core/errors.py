@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 
 class InputError(ValueError):
@@ -30,6 +31,15 @@ class InputError(ValueError):
             comma = "" if problem.endswith((":", ";")) or not problem else ","
             problem = f"{problem}{comma} expected {self.expected}".lstrip()
         super().__init__(f"{self.where}: {problem}" if self.where else problem)
+
+
+@contextlib.contextmanager
+def errors_in(where: object) -> Iterator[None]:
+    """Raise an ``InputError`` of the block with ``where`` put before its own place, see ``InputError``."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(error, where=where) from error
 
 
 class UsageError(InputError):

@@ -27,7 +27,7 @@ from bidnerf_core.camera.lenses import (
     PanoramaFace,
     colmap_camera,
 )
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, errors_in
 from bidnerf_core.io import Record, parse_json, parse_record, parse_rows, parse_yaml, read_file
 
 KEYS = {
@@ -87,7 +87,7 @@ class CameraRecord:
 
         A panorama becomes its front face. Raises ``InputError`` for implausible values.
         """
-        try:
+        with errors_in(self.record.where):
             if self.model == PANORAMA:
                 return PanoramaFace("front", (width, height))
             fx, fy = (
@@ -100,8 +100,6 @@ class CameraRecord:
             flat = Intrinsics(*numbers, () if is_lens else self.coefficients)
             question_focal(flat.fx, width, height)
             return CentralLens(self.model, flat, self.coefficients) if is_lens else flat
-        except InputError as error:
-            raise self.record.error(error) from error
 
 
 def camera_record(record: Record) -> CameraRecord:
@@ -287,12 +285,10 @@ def _opencv_camera(where: str, K: Any, lens: tuple[float, ...], model: str, size
         raise InputError(
             f"distortion model {model}", where=where, expected="plumb_bob, rational_polynomial or equidistant"
         )
-    try:
+    with errors_in(where):
         if kind == PERSPECTIVE:
             return Intrinsics.from_opencv(K, lens or None, size)
         return CentralLens(FISHEYE, Intrinsics.from_opencv(K, None, size), (*lens, 0.0, 0.0, 0.0, 0.0)[:4])
-    except InputError as error:
-        raise InputError(error, where=where) from error
 
 
 def _first(values: Mapping[str, Any], what: str) -> Any:

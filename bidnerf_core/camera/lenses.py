@@ -21,7 +21,7 @@ from jaxtyping import Float
 
 from bidnerf_core.camera.exif import UPRIGHT, Orientation
 from bidnerf_core.camera.intrinsics import LIMITS, Intrinsics, check_number, same_aspect
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, errors_in
 
 WIDEST = math.radians(60)
 """Largest angle (radians) between the optical axis and the middle of a side of an undistorted image: beyond this
@@ -223,8 +223,10 @@ class PanoramaFace(Lens):
 
     def __post_init__(self) -> None:
         if not same_aspect(self.stored_size, (2, 1)):
-            size = "x".join(map(str, self.stored_size))
-            raise InputError(f"an equirectangular image is {size}", expected="twice as many columns as rows")
+            raise InputError(
+                f"an equirectangular image is {'x'.join(map(str, self.stored_size))}",
+                expected="twice as many columns as rows",
+            )
 
     def resized(self, width: int, height: int) -> PanoramaFace:
         return replace(self, stored_size=(width, height))
@@ -286,7 +288,7 @@ def colmap_camera(where: str, model: str, width: int, height: int, parameters: S
     parameters is wrong or a value is invalid.
     """
     _, kind, indices = MODELS[model]
-    try:
+    with errors_in(where):
         if len(parameters) != max(indices) + 1:
             raise InputError(f"{model} has {len(parameters)} parameters", expected=max(indices) + 1)
         if kind == PANORAMA:
@@ -295,8 +297,6 @@ def colmap_camera(where: str, model: str, width: int, height: int, parameters: S
         lens = tuple(rest) if any(rest) else ()
         flat = Intrinsics(fx, fy, cx, cy, width, height, lens if kind == PERSPECTIVE else ())
         return flat if kind == PERSPECTIVE else CentralLens(model, flat, tuple(rest))
-    except InputError as error:
-        raise InputError(error, where=where) from error
 
 
 def colmap_model(camera: Intrinsics) -> tuple[str, list[float]]:

@@ -15,7 +15,7 @@ from bidnerf_core.camera.exif import UPRIGHT, Exif, Orientation
 from bidnerf_core.camera.files import read_camera
 from bidnerf_core.camera.intrinsics import Intrinsics, cameras_at_size, reduced_size, same_aspect
 from bidnerf_core.camera.lenses import Camera, Lens
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, errors_in
 
 CameraKind = TypeVar("CameraKind", Intrinsics, Lens, Camera)
 WAYS = "--camera FILE, --focal PX or --hfov DEG (camera=, focal=, hfov= in Python)"
@@ -113,11 +113,6 @@ class CameraSource:
         """Whether the camera is given, rather than found in EXIF or assumed."""
         return any(given is not None for given in (self.camera, self.focal, self.hfov))
 
-    def require(self, path: Path, why: str) -> None:
-        """Raise ``InputError`` if no camera is given or assumed; ``why`` states why one is needed."""
-        if not self.is_given and not self.assumed:
-            raise InputError(why, where=path, expected=f"a camera: {WAYS}")
-
     def find(self, where: Path | str, raster: Raster, exif: Exif | None = None) -> ResolvedCamera:
         """Return the camera of an upright image: the given one, else the one in EXIF, else one of the ``assumed`` ones.
 
@@ -128,13 +123,11 @@ class CameraSource:
         exif = exif or Exif()
         if sum(given is not None for given in (camera, focal, hfov)) > 1:
             raise InputError("several cameras are given", where=where, expected=f"one of {WAYS}")
-        try:
+        with errors_in(where):
             if focal is not None:
                 return _describe(Intrinsics.from_focal(focal, *size), f"focal length {focal:g} px, as given")
             if hfov is not None:
                 return _describe(Intrinsics.from_hfov(hfov, *size), f"horizontal field of view {hfov:g} deg")
-        except InputError as error:
-            raise InputError(error, where=where) from error
         if camera is None:
             resolved = None if exif.has_focal_length else _assume(raster, self.assumed)
             # Where a crop lies in its photo is unknown. Only landmarks can correct its principal point, and there are
@@ -182,8 +175,9 @@ def folder_camera(
 
 
 def _describe(camera: Intrinsics, origin: str) -> ResolvedCamera:
-    centred = "(the principal point is assumed to be the image centre)"
-    return ResolvedCamera(camera, f"{origin}: {camera.sentence} {centred}")
+    return ResolvedCamera(
+        camera, f"{origin}: {camera.sentence} (the principal point is assumed to be the image centre)"
+    )
 
 
 def _fit(where: str, raster: Raster, given: Camera, origin: str) -> ResolvedCamera:

@@ -131,10 +131,6 @@ class CaptureReport:
         coverage = replace(self.coverage, centre=scale_point(self.coverage.centre, factor))
         return replace(self, photos=photos, coverage=coverage, trial=self.trial.scaled(factor))
 
-    def with_problem(self, *problems: PhotoProblem) -> list[PhotoRecord]:
-        """Return the photos that have any of the problems, in capture order."""
-        return [photo for photo in self.photos if set(photo.problems) & set(problems)]
-
 
 def summary(report: CaptureReport) -> list[str]:
     """Return at most ``SUMMARY_LINES`` lines of the report; if some were left out, the last line gives their number."""
@@ -173,7 +169,7 @@ def sentences(report: CaptureReport) -> list[str]:
         ),
     ]
     for problem, (what, advice) in PROBLEMS.items():
-        names = [photo.name for photo in report.with_problem(problem)]
+        names = [photo.name for photo in report.photos if problem in photo.problems]
         more = f" and {len(names) - 6} more" if len(names) > 6 else ""
         are = "is" if len(names) == 1 else "are"
         remarks.append((bool(names), f"{', '.join(names[:6])}{more} {are} {what}: {advice}"))

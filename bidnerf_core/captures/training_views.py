@@ -193,8 +193,7 @@ def _with_landmarks(views: Sequence[View], tracked: TrackedViews) -> list[View]:
     if not any(map(_lacks_distances, views)):
         return list(views)
     seen = tracked.landmarks_by_image(DEFAULT_LANDMARKS)
-    count = sum(len(part.distance) for part in seen)
-    log.info(f"{count} sightings of landmarks in {len(views)} views")
+    log.info(f"{sum(len(part.distance) for part in seen)} sightings of landmarks in {len(views)} views")
     return [replace(view, landmarks=part) for view, part in zip(views, seen, strict=True)]
 
 

@@ -280,8 +280,11 @@ class Capture:
         if name not in self._by_split:
             every = name == "all" and name not in self.splits
             if not every and name not in self.splits:
-                known = ", ".join(self.splits) or "none, since only images with poses are in a split"
-                raise InputError(f"no split {name!r}", where=self.path, expected=f"one of {known}")
+                raise InputError(
+                    f"no split {name!r}",
+                    where=self.path,
+                    expected=f"one of {', '.join(self.splits) or 'none, since only images with poses are in a split'}",
+                )
             own = [shot for shot in self.shots if (shot.splits if every else name in shot.splits)]
             self._by_split[name] = replace(self, shots=_name_shots(own, one_split=not every))
         return self._by_split[name]
@@ -377,8 +380,11 @@ class Capture:
         if not posed:
             raise InputError(f"has no pose for any of {images}", where=where, expected=self.poses_expected)
         if posed < len(self):
-            why = f": {self.unposed}" if self.unposed else ""
-            warn_about(where, f"{len(self) - posed} of {images} have no pose and are left out{why}")
+            warn_about(
+                where,
+                f"{len(self) - posed} of {images} have no pose and are left out"
+                + (f": {self.unposed}" if self.unposed else ""),
+            )
         return self
 
     def view(self, shot: Shot, limit: int | None = None) -> View:

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import errors_in
 from bidnerf_core.geometry import RIGID_TO, SE3, rigid_pose
 from bidnerf_core.io import Record
 
@@ -31,10 +31,8 @@ def camera_of(
     are invalid for a camera.
     """
     fx, fy, cx, cy = numbers
-    try:
+    with errors_in(where):
         return Intrinsics(fx, fy, cx + first_centre, cy + first_centre, *size, tuple(lens) if any(lens) else ())
-    except InputError as error:
-        raise InputError(error, where=where) from error
 
 
 def pose_and_scale(record: Record, key: str = "transform_matrix") -> tuple[SE3, float]:

@@ -202,8 +202,7 @@ def read_trajectory(path: Path, times: Sequence[float] | None = None) -> Traject
     if not known:
         raise InputError("has no finite pose", where=path, expected=f"lines of timestamp {POSE}")
     if len(known) < len(timed):
-        left = amount(len(timed) - len(known), "pose")
-        warn_about(path, f"{left} of {len(timed)} not finite or zero, left out")
+        warn_about(path, f"{amount(len(timed) - len(known), 'pose')} of {len(timed)} not finite or zero, left out")
     for (one, pose), (other, others) in pairwise(known):
         if one.time == other.time and pose != others:
             raise InputError(
@@ -235,8 +234,11 @@ def pose_numbers(where: str, numbers: Sequence[float], order: str = "xyzw") -> l
     if length == 0 or not all(map(math.isfinite, numbers)):
         return None
     if abs(length - 1) > 0.01:  # more than rounding explains, for example to four decimals
-        names = " ".join(f"q{letter}" for letter in order)
-        raise InputError(f"the quaternion has length {length:.3g}", where=where, expected=f"1 ({names})")
+        raise InputError(
+            f"the quaternion has length {length:.3g}",
+            where=where,
+            expected=f"1 ({' '.join(f'q{letter}' for letter in order)})",
+        )
     return [*numbers[:3], *(quaternion[letter] for letter in "xyzw")]
 
 

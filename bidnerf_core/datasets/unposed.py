@@ -94,8 +94,11 @@ def _without_copies(folder: Path, photos: Sequence[Path]) -> list[Path]:
             if width < whole_width and abs(height - width * whole_height / whole_width) <= 1:
                 copies.append(below)
     if copies:
-        names = enumeration([str(below.relative_to(folder)) for below in copies])
-        warn_about(folder, f"{names}: smaller copies of the photos beside them, which are left out")
+        warn_about(
+            folder,
+            f"{enumeration([str(below.relative_to(folder)) for below in copies])}: smaller copies of the photos beside"
+            " them, which are left out",
+        )
     return [photo for photo in photos if photo.parent not in copies]
 
 

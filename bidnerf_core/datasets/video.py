@@ -34,7 +34,6 @@ class Video:
     """
 
     def __init__(self, path: Path) -> None:
-        require_av(path)
         self.path = path
         with open_binary(path, "a video file"):
             pass
@@ -142,22 +141,19 @@ def is_video(path: Path) -> bool:
     return mp4 or head[:4] == b"\x1aE\xdf\xa3" or (head[:4] == b"RIFF" and head[8:12] == b"AVI ")
 
 
-def require_av(path: Path) -> None:
-    """Raise ``InputError``, which states what to install, if the extra ``video`` is missing."""
+@contextmanager
+def _open_stream(path: Path) -> Iterator[tuple[Any, Any]]:
+    """Open a video file; only its first video stream is read.
+
+    Raises ``InputError`` if it is not a video, and, with what to install, if the extra ``video`` is missing.
+    """
     try:
-        import av  # noqa: F401
+        import av
     except ImportError as error:
         raise InputError(
             "reading a video needs the extra 'video' (pip install 'bidnerf[video]'); or extract its frames to a folder",
             where=path,
         ) from error
-
-
-@contextmanager
-def _open_stream(path: Path) -> Iterator[tuple[Any, Any]]:
-    """Open a video file; only its first video stream is read. Raises ``InputError`` if it is not a video."""
-    import av
-
     try:
         with av.open(str(path.resolve()), options=OPTIONS) as container:
             if not container.streams.video:

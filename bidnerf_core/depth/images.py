@@ -77,8 +77,10 @@ def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> Dept
     values = to_numpy(raw)
     values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
     if values.ndim != 2 or not values.size or values.dtype.kind not in "uif":
-        shape = f"{'x'.join(map(str, values.shape))} of {values.dtype.name}"
-        raise InputError(f"{what} is {shape}", expected="one channel of integer or floating-point numbers")
+        raise InputError(
+            f"{what} is {'x'.join(map(str, values.shape))} of {values.dtype.name}",
+            expected="one channel of integer or floating-point numbers",
+        )
     if unit is None:
         unit = 1.0 if values.dtype.kind == "f" else MILLIMETRE
     given: Any = unit

@@ -58,9 +58,10 @@ class DepthCamera:
         height, width = depth.shape
         camera = Raster(width, height).upright(self.camera)
         if camera is None:
-            given = f"{self.camera.width}x{self.camera.height}"
             raise InputError(
-                f"depth is {width}x{height}", where=file, expected=f"the aspect ratio of its camera, {given}"
+                f"depth is {width}x{height}",
+                where=file,
+                expected=f"the aspect ratio of its camera, {self.camera.width}x{self.camera.height}",
             )
         coarse = colour.scaled(min(1.0, camera.fx / colour.fx, camera.fy / colour.fy))
         measured = depth > 0

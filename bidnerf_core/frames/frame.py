@@ -310,9 +310,9 @@ class Frame:
         raster = Raster(colour.shape[1], colour.shape[0])
         intrinsics = raster.upright(camera)
         if intrinsics is None:
-            actual, expected = f"{raster.width}x{raster.height}", f"{camera.width}x{camera.height}"
             raise InputError(
-                f"rgb is {actual}, but its camera expects {expected} or a size of the same aspect ratio",
+                f"rgb is {raster.width}x{raster.height}, but its camera expects {camera.width}x{camera.height} or a size"
+                " of the same aspect ratio",
                 where=where,
             )
         metres = None
@@ -405,8 +405,9 @@ def _check_image(where: str, what: str, image: object, camera: Intrinsics) -> No
             expected="(height, width, 3); Frame.from_numpy takes grey and RGBA" if what == "rgb" else "(height, width)",
         )
     if shape != wanted:
-        expects = f"{camera.width}x{camera.height}"
-        raise InputError(f"{what} is {shape[1]}x{shape[0]}, but its camera expects {expects}", where=where)
+        raise InputError(
+            f"{what} is {shape[1]}x{shape[0]}, but its camera expects {camera.width}x{camera.height}", where=where
+        )
     if image.layout != torch.strided or (image.is_meta and type(image) is Tensor):
         raise InputError(f"{what} is a sparse tensor or has no values", where=where, expected="a dense one")
     if image.dtype == {"rgb": torch.uint8, "hidden": torch.bool}.get(what):

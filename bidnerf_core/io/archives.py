@@ -28,9 +28,8 @@ class Archive:
             self._zip = zipfile.ZipFile(path)
             members = self._zip.infolist()
         except DAMAGES as error:
-            cut = begins == b"PK"
             raise InputError(
-                "ends too early, probably an incomplete copy" if cut else f"is not a zip archive ({error})",
+                "ends too early, probably an incomplete copy" if begins == b"PK" else f"is not a zip archive ({error})",
                 where=path,
                 expected=expected,
             ) from error

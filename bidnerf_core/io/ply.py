@@ -40,11 +40,6 @@ class PlyElement:
     properties: dict[str, str]  # NumPy types with their byte order, by name
     lists: list[str]  # the names of properties that are lists
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The names of the numeric properties."""
-        return tuple(self.properties)
-
 
 @dataclass(frozen=True)
 class PlyHeader:
@@ -53,10 +48,6 @@ class PlyHeader:
     is_text: bool
     elements: dict[str, PlyElement]
     length: int  # bytes
-
-    def element(self, name: str) -> PlyElement | None:
-        """Return the declaration of the elements with that name, or None if there are none."""
-        return self.elements.get(name)
 
 
 def read_ply_header(path: Path, expected: str = "a PLY file") -> PlyHeader:

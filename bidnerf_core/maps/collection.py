@@ -180,7 +180,18 @@ class MapCollection:
             rays = getattr(localizer.config, "fused_rays", 0)
             found = localize_by_landmarks(localizer.problem(frame), rays, seed)
         except InputError as error:  # such as a map without a surface
-            return _no_localization(str(error), self.method)
+            T = SE3.identity()  # of no meaning
+            return Localization(
+                T,
+                Outcome.TOO_FEW_MATCHES,
+                str(error),
+                0,
+                0.0,
+                math.nan,
+                self.method,
+                SE3.stack([T]),
+                torch.zeros(0, dtype=torch.float64),
+            )
         return replace(found, unit=unit_of(localizer.scene)).translated(origin_of(localizer.scene))
 
     def _index(self) -> dict[str, tuple[str, int]]:
@@ -245,22 +256,6 @@ def _maps_by_name(scenes: str | Path | Sequence[Map | str | Path] | Mapping[str,
     if not found:
         raise InputError("no maps", expected="at least one")
     return name_maps(found)
-
-
-def _no_localization(reason: str, method: str) -> Localization:
-    """Return the answer for a map in which an image was not recognized at all; its pose is meaningless."""
-    T = SE3.identity()
-    return Localization(
-        T,
-        Outcome.TOO_FEW_MATCHES,
-        reason,
-        0,
-        0.0,
-        math.nan,
-        method,
-        SE3.stack([T]),
-        torch.zeros(0, dtype=torch.float64),
-    )
 
 
 def _merit(found: Localization) -> tuple[bool, float, float]:

@@ -172,15 +172,22 @@ def load_info(folder: Path) -> MapInfo:
         raise InputError("not the description of a map", where=path, expected='"format": "bidnerf map"')
     if found.get("version") != VERSION:
         newer = isinstance(found.get("version"), int) and found["version"] > VERSION
-        advice = "it was written by a newer bidnerf; upgrade bidnerf" if newer else "retrain the map"
-        raise InputError(f"version {found.get('version')!r}", where=path, expected=f"{VERSION}; {advice}")
+        raise InputError(
+            f"version {found.get('version')!r}",
+            where=path,
+            expected=f"{VERSION}; {'it was written by a newer bidnerf; upgrade bidnerf' if newer else 'retrain the map'}",
+        )
     for part in PART_NAMES:
         name = found.get(part)
         if isinstance(name, str) and (not name or Path(name).name != name):
             raise InputError(f"names {name!r}", where=path, expected="the name of a file next to it")
     if unknown := sorted(found.keys() - {part.name for part in fields(MapInfo)}):
-        text = f"{path}: ignored {enumeration(unknown)}, which this bidnerf does not know"
-        warnings.warn(f"{text}; the map was written by bidnerf {found.get('bidnerf')}", InputWarning, stacklevel=2)
+        warnings.warn(
+            f"{path}: ignored {enumeration(unknown)}, which this bidnerf does not know; the map was written by bidnerf"
+            f" {found.get('bidnerf')}",
+            InputWarning,
+            stacklevel=2,
+        )
         found = {key: value for key, value in found.items() if key not in unknown}
     info = from_plain(MapInfo, found, str(path))
     if (folder / ANCHOR).exists():

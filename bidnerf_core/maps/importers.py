@@ -122,12 +122,15 @@ def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
     if len(able) == 1:
         return able[0]
     if able:
-        names = enumeration([each for each, _ in able])
-        raise InputError(f"{names} can each read it; choose one of them (--as)", where=path)
+        raise InputError(
+            f"{enumeration([each for each, _ in able])} can each read it; choose one of them (--as)", where=path
+        )
     known = "; ".join(f"{each} reads {importer.summary}" for each, importer in found)
     absent = [f"bidnerf-{each} for {what}" for each, what in OFFERED.items() if each not in IMPORTERS]
-    hint = f"; pip install {enumeration(absent)}" if absent else ""
-    raise InputError(f"no installed importer recognizes it ({known}){hint}", where=path)
+    raise InputError(
+        f"no installed importer recognizes it ({known})" + (f"; pip install {enumeration(absent)}" if absent else ""),
+        where=path,
+    )
 
 
 def robust_box(

@@ -149,8 +149,10 @@ def import_map(
             log.info(f"{where}: {amount(len(cameras), 'camera')} of its training images found next to it")
         elif read is None:
             cameras = viewpoints(scene.field, bounds, found.up, found.is_solid)
-            around = "around it" if found.is_solid else "found in free space"
-            log.info(f"{where}: no photos; viewed from {amount(len(cameras), 'viewpoint')} {around}")
+            log.info(
+                f"{where}: no photos; viewed from {amount(len(cameras), 'viewpoint')}"
+                f" {'around it' if found.is_solid else 'found in free space'}"
+            )
         scene = replace(scene, info=replace(info, cameras=cameras))
         if views:
             scene.check_alike(views, where)
@@ -264,8 +266,8 @@ def _report_extent(found: ImportedField, where: str, unit: LengthUnit) -> None:
         lower, upper = robust_box(found.points, margin=0.0)
         size = (upper - lower).tolist()
     extent = " x ".join(f"{side:.3g}" for side in size)
-    known = " metres" if unit == "metres" else "; its unit is not stored (--scale gives its length in metres)"
-    log.info(f"{where}: extent {extent}{known}")
+    unknown = "; its unit is not stored (--scale gives its length in metres)"
+    log.info(f"{where}: extent {extent}{' metres' if unit == 'metres' else unknown}")
     # The longest side of a plausible scene is between 5 cm and 500 m; other lengths are probably in another unit.
     if not 0.05 <= max(size) <= 500:
         doubt = (
@@ -306,7 +308,8 @@ def _bake(scene: Map, found: ImportedField, views: Sequence[View], config: BakeC
             f"{name}: landmarks are from rendered images, which match photos less well; --photos builds them from photos,"
             " as in training"
         )
-    return scene.with_baked_parts(views, config, not views, surface=surface)
+    scene, tracked = scene.with_landmarks(views, not views)
+    return scene.with_surface(views, config, surface).with_survey(views, tracked)
 
 
 def viewpoints(

@@ -70,10 +70,9 @@ def factor_of_poses(scene: Map, known: Mapping[str, SE3 | Position]) -> ScaleFit
         raise InputError("two known poses belong to the same camera of the map", expected="one for each")
     if len(found) < 3:  # two give a scale that cannot be checked
         cameras = scene.info.cameras
-        example = f" such as {cameras[0].name!r}" if cameras else ""
         raise InputError(
             f"{len(found)} of {len(known)} known poses belong to cameras of the map",
-            expected=f"at least 3, matched by name{example}",
+            expected="at least 3, matched by name" + (f" such as {cameras[0].name!r}" if cameras else ""),
         )
     source = torch.stack([camera.pose.translation for camera in found.values()])
     target = torch.stack([_position(known[name]) for name in found])
@@ -104,7 +103,15 @@ def locate_point(scene: Map, point: Place) -> Float[Tensor, "3"]:
         return _seen_at(scene, camera, numbers[0], numbers[1]) + origin_of(scene)
     if not at and len(numbers) == 3:
         return torch.tensor(numbers, dtype=torch.float64)
-    raise InputError(f"no place {point!r} in the map: {_no_camera(scene, name if at else point)}")
+    missing, names = name if at else point, [camera.name for camera in scene.info.cameras]
+    if not names:
+        raise InputError(f"no place {point!r} in the map: it has no cameras; expected coordinates X,Y,Z")
+    hint = spelling_hint(missing, names, f", expected a name such as {names[0]!r}")
+    raise InputError(
+        f"no place {point!r} in the map: none of its {len(names)} cameras is called {missing!r}{hint} (photos held out"
+        " for tests, every eighth unless trained with --split all, are not in the map); or give NAME@U,V for what a"
+        " camera shows at a pixel, or coordinates X,Y,Z"
+    )
 
 
 def _position(given: SE3 | Position) -> Float[Tensor, "3"]:
@@ -126,18 +133,6 @@ def _camera_of(scene: Map, name: str) -> StoredCamera | None:
     return cameras.get(name) or cameras.get(stem) or (ending[0] if len(ending) == 1 else None)
 
 
-def _no_camera(scene: Map, name: str) -> str:
-    """Return the error message for a name that no camera of the map has, with other ways to specify a point."""
-    names = [camera.name for camera in scene.info.cameras]
-    if not names:
-        return "it has no cameras; expected coordinates X,Y,Z"
-    hint = spelling_hint(name, names, f", expected a name such as {names[0]!r}")
-    return (
-        f"none of its {len(names)} cameras is called {name!r}{hint} (photos held out for tests, every eighth unless trained with"
-        " --split all, are not in the map); or give NAME@U,V for what a camera shows at a pixel, or coordinates X,Y,Z"
-    )
-
-
 @torch.no_grad()
 def _seen_at(scene: Map, camera: StoredCamera, u: float, v: float) -> Float[Tensor, "3"]:
     """Return the point (float64, relative to the map's origin) that the field shows at a pixel of a camera.
@@ -145,8 +140,10 @@ def _seen_at(scene: Map, camera: StoredCamera, u: float, v: float) -> Float[Tens
     Raises ``InputError`` for a pixel outside the image or on the background.
     """
     if not (0 <= u <= camera.intrinsics.width and 0 <= v <= camera.intrinsics.height):
-        size = f"{camera.intrinsics.width}x{camera.intrinsics.height}"
-        raise InputError(f"pixel {u:g},{v:g} is outside {camera.name}, whose image in the map is {size}")
+        raise InputError(
+            f"pixel {u:g},{v:g} is outside {camera.name}, whose image in the map is"
+            f" {camera.intrinsics.width}x{camera.intrinsics.height}"
+        )
     ray = camera.intrinsics.unproject(torch.tensor([[u, v]], dtype=torch.float64))
     direction = camera.pose.rotate(ray / ray.norm(dim=-1, keepdim=True))
     origin = camera.pose.translation[None]

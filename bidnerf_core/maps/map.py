@@ -274,7 +274,8 @@ class Map:
                 if own and not any((c.name, c.T_world_camera) in own for c in stored_cameras(views)):
                     # None of them was used to build the map: they may be of another scene.
                     self.check_alike(views, self.name)
-            return scene.with_baked_parts(views, config, rendered_landmarks)
+            scene, tracked = scene.with_landmarks(views, rendered_landmarks)
+            return scene.with_surface(views, config).with_survey(views, tracked)
 
     def check_alike(self, views: Sequence[View], where: str) -> None:
         """Raise ``InputError`` if photos differ too much from the field's renderings, whether or not the map was built from them."""
@@ -288,22 +289,6 @@ class Map:
                 where=where,
                 expected="photos of the same scene, with poses in the coordinates of the map",
             )
-
-    def with_baked_parts(
-        self,
-        views: Sequence[View],
-        config: BakeConfig,
-        rendered_landmarks: bool = False,
-        tracked: TrackedViews | None = None,
-        surface: SurfaceMap | None = None,
-    ) -> Map:
-        """Bake as ``bake`` does, from views that have the map's poses; the caller must hold the folder's lock.
-
-        ``tracked`` holds the keypoints of the views if already tracked, and ``surface`` the surface if already
-        built.
-        """
-        scene, tracked = self.with_landmarks(views, rendered_landmarks, tracked)
-        return scene.with_surface(views, config, surface).with_survey(views, tracked)
 
     def with_landmarks(
         self, views: Sequence[View], rendered: bool = False, tracked: TrackedViews | None = None
@@ -375,9 +360,9 @@ class Map:
         if not any(view.frame.has_dense_depth for view in measured):
             measured = []  # a few points do not make a surface
         surface = bake(self.field, self.bounds, [] if measured else cameras, measured, config)
-        source = f"{len(measured)} measured" if measured else f"{len(cameras)} rendered"
         log.info(
-            f"{self.name}: surface of {len(surface.surfels)} surfels from {source} views,"
+            f"{self.name}: surface of {len(surface.surfels)} surfels from"
+            f" {f'{len(measured)} measured' if measured else f'{len(cameras)} rendered'} views,"
             f" {time.monotonic() - started:.1f} s"
         )
         return self.with_parts(surface)
@@ -388,12 +373,14 @@ class Map:
     def with_survey(self, views: Sequence[View], tracked: TrackedViews | None) -> Map:
         """Return the map with the capture record of the photos ``views`` and the field's colour error on them.
 
-        ``tracked`` holds the keypoints of the photos. Without photos or without keypoints, the map is returned
-        unchanged.
+        ``tracked`` holds the keypoints of the photos. If it is None, they are tracked unless the map has a capture record.
+        Without photos, the map is returned unchanged.
         """
-        if not views or tracked is None:
+        if not views or (tracked is None and self.info.capture is not None):
             return self
         check_cancelled("survey")
+        if tracked is None:
+            tracked = track_views(views, self.info.landmark_features)
         noise = colour_noise(self.field, self.bounds, views) if self.has_field else None
         scene = replace(self, info=replace(self.info, colour_noise=noise))
         counter("surveying the photos", "stage")(0, 1)
@@ -477,5 +464,4 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
     return Map(info, build_frozen_field(info, weights, folder), surface, landmarks, folder).to(device)
 
 
-for kind in (str, Path):  # a Localizer opens a folder
-    scene_of.register(kind, lambda folder, where: load_map(folder))
+scene_of.register(str | Path, lambda folder, where: load_map(folder))  # a Localizer opens a folder

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from bidnerf_core.backend import UpgradingField, load_backend
 from bidnerf_core.captures import CaptureReport
-from bidnerf_core.errors import InputError, amount
+from bidnerf_core.errors import InputError, amount, errors_in
 from bidnerf_core.fields import NoField, RadianceField, ScaledField, trained_field
 from bidnerf_core.io import (
     from_plain,
@@ -52,7 +52,6 @@ from bidnerf_core.training import TrainingState, TrainingStep
 
 NEEDED = "a safetensors file, without which the map is incomplete"
 BAKED = "a safetensors file, which 'bidnerf bake' can recreate"
-RECORDED = "a capture record, which 'bidnerf bake' with --data can recreate"
 _NAMES = r"((weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors|capture-\d{8,}-[0-9a-f]{8}\.json)"
 OURS = re.compile(rf"{_NAMES}|\.({_NAMES}|map\.json)\.[0-9a-f]{{8}}")
 """Pattern of the names of files that saving, also by earlier versions, may leave behind. Other files are never removed."""
@@ -87,7 +86,15 @@ PARTS = {
         lambda landmarks: tensors_to_bytes(landmark_tensors(landmarks)),
         lambda path: load_part(path, landmarks_from_tensors, "landmarks", BAKED),
     ),
-    "capture": PartFile(_json, lambda path: from_plain(CaptureReport, read_json(path, RECORDED), str(path)), "json"),
+    "capture": PartFile(
+        _json,
+        lambda path: from_plain(
+            CaptureReport,
+            read_json(path, "a capture record, which 'bidnerf bake' with --data can recreate"),
+            str(path),
+        ),
+        "json",
+    ),
 }
 """The parts of a map, by the keys of ``map.json`` that name their files."""
 
@@ -115,10 +122,14 @@ def write_parts(
     """
     if landmarks is not None and not landmarks.features:
         raise InputError("the landmarks' detector has no name;", where=folder, expected="a registered one")
-    contents: dict[str, Any] = {"surface": surface, "landmarks": landmarks, "capture": capture}
-    if state is not None:
-        contents |= {"weights": state.field, "training": None if info.complete else state.optimizer}
-    contents = {part: content for part, content in contents.items() if content is not None}
+    given: dict[str, Any] = {
+        "surface": surface,
+        "landmarks": landmarks,
+        "capture": capture,
+        "weights": None if state is None else state.field,
+        "training": None if state is None or info.complete else state.optimizer,
+    }
+    contents = {part: content for part, content in given.items() if content is not None}
     names: dict[str, Any] = {
         part: f"{part}-{info.step:08d}-{secrets.token_hex(4)}.{PARTS[part].ending}" for part in contents
     }
@@ -128,17 +139,22 @@ def write_parts(
         stored = load_info(folder)
         if stored.weights != info.weights:
             raise InputError(f"was retrained while its {next(iter(contents))} was built; bake it again", where=folder)
-        info, given = stored, info
         if landmarks is not None:
-            names |= {"landmark_features": landmarks.features, "landmark_source": given.landmark_source}
+            names |= {"landmark_features": landmarks.features, "landmark_source": info.landmark_source}
         if landmarks is not None or capture is not None:
-            names |= {"colour_noise": given.colour_noise}
+            names |= {"colour_noise": info.colour_noise}
+        info = stored
     if state is not None and names["landmarks"] is None:
         names |= {"landmark_source": None, "colour_noise": None}
     info = replace(info, **names)
     description = _json(info)
     folder.mkdir(parents=True, exist_ok=True)
-    _adopt_anchor(folder)
+    # The content of a user-written ``anchor.json`` moves into the description of the map in the folder. Even if writing
+    # is then interrupted, the anchor never ends up next to the description of another map.
+    if (folder / ANCHOR).exists():
+        with contextlib.suppress(InputError):  # no map to which the anchor could belong, or a damaged one
+            write_file(folder / DESCRIPTION, _json(load_info(folder)))
+            (folder / ANCHOR).unlink()
     try:
         for part, content in contents.items():
             write_file(folder / names[part], PARTS[part].encode(content))
@@ -274,10 +290,8 @@ def check_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) 
     lines.
     """
     if isinstance(field, UpgradingField):
-        try:
+        with errors_in(path):
             tensors = field.upgraded_state(tensors)
-        except InputError as error:
-            raise InputError(error, where=path) from error
     module = cast(nn.Module, field)
     expected, trained = module.state_dict(), {name for name, _ in module.named_parameters()}
     for name, value in expected.items():
@@ -290,8 +304,11 @@ def check_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) 
         # Products of larger weights would overflow in float32; trained weights are far smaller.
         largest = 1e9 if name in trained else math.inf
         if found.is_floating_point() and not bool((found.abs() <= largest).all()):
-            above = f" or numbers above {largest:g}" if name in trained else ""
-            raise InputError(f"tensor {name!r} holds NaN{above}", where=path, expected="trained weights")
+            raise InputError(
+                f"tensor {name!r} holds NaN" + (f" or numbers above {largest:g}" if name in trained else ""),
+                where=path,
+                expected="trained weights",
+            )
     if surplus := sorted(tensors.keys() - expected.keys()):
         raise InputError(f"tensor {surplus[0]!r} is not part of the field that map.json describes", where=path)
     return tensors
@@ -375,17 +392,6 @@ def map_folder(out: Path, overwrite: bool) -> Iterator[None]:
 
     with output_folder(out, overwrite, is_leftover, describe):
         yield
-
-
-def _adopt_anchor(folder: Path) -> None:
-    """Move the content of a user-written ``anchor.json`` into the description of the map in the folder.
-
-    Even if writing is then interrupted, the anchor never ends up next to the description of another map.
-    """
-    if (folder / ANCHOR).exists():
-        with contextlib.suppress(InputError):  # no map to which the anchor could belong, or a damaged one
-            write_file(folder / DESCRIPTION, _json(load_info(folder)))
-            (folder / ANCHOR).unlink()
 
 
 def _sweep(folder: Path) -> None:

@@ -51,13 +51,7 @@ class MapSummary:
     def of(scene: Map) -> MapSummary:
         """Return the summary of a map."""
         info, field, surface, folder = scene.info, scene.field, scene.surface, scene.folder
-        refinement, capture, landmarks, size = info.pose_refinement, scene.capture, scene.landmarks, None
-        if surface is not None:
-            size = {
-                "cell": surface.cell,  # side of a cell of its index
-                "cells": surface.stored_cells,
-                "MiB": round(surface.mebibytes, 1),
-            }
+        refinement, capture, landmarks = info.pose_refinement, scene.capture, scene.landmarks
         facts = {
             "map": "" if folder is None else str(folder),
             "cameras": len(info.cameras),
@@ -67,7 +61,13 @@ class MapSummary:
             "levels": len(levels(field)),
             "parameters": sum(p.numel() for p in field.parameters()) if isinstance(field, nn.Module) else 0,
             "surfels": 0 if surface is None else len(surface.surfels),
-            "surface": size,
+            "surface": None
+            if surface is None
+            else {
+                "cell": surface.cell,  # side of a cell of its index
+                "cells": surface.stored_cells,
+                "MiB": round(surface.mebibytes, 1),
+            },
             "landmarks": 0 if landmarks is None else len(landmarks),
             "trial": None if landmarks is None else landmarks.trial,
             "bytes": None
@@ -76,10 +76,8 @@ class MapSummary:
             "moved": tuple(moved_cameras(info.cameras)),
             "capture": capture,
         }
-        remarks = [] if refinement is None else pose_sentences(info.cameras, refinement)
-        if capture is not None:
-            remarks += sentences(capture)
-        return MapSummary(info, facts, tuple(remarks))
+        poses = [] if refinement is None else pose_sentences(info.cameras, refinement)
+        return MapSummary(info, facts, (*poses, *([] if capture is None else sentences(capture))))
 
     def plain(self) -> dict[str, Any]:
         """Return the facts as JSON-serializable values."""
@@ -98,8 +96,7 @@ class MapSummary:
         built = "none"
         if info.step:
             state = "complete" if info.complete else "not complete; 'bidnerf train --resume' continues it"
-            time = duration_text(info.seconds)
-            training = f"{info.step} steps of backend {info.backend} in {time}, {state}"
+            training = f"{info.step} steps of backend {info.backend} in {duration_text(info.seconds)}, {state}"
             field = f"{amount(facts['parameters'], 'parameter')} in {amount(facts['levels'], 'level')}"
             if info.colour_noise is not None:
                 field += f", off by {info.colour_noise:.1%} of the range of colours on its training images (RMS)"
@@ -127,8 +124,8 @@ class MapSummary:
             "landmarks": str(facts["landmarks"] or "none; 'bidnerf bake MAP --data DATA' builds them"),
             "settings": _shown(info.config) if info.config else "",
         }
-        listed = [f"{key + ':':<12} {value}" for key, value in rows.items() if value]
-        return "\n".join([*listed, *(f"- {sentence}" for sentence in self.remarks)])
+        lines = (f"{key + ':':<12} {value}" for key, value in rows.items() if value)
+        return "\n".join([*lines, *(f"- {sentence}" for sentence in self.remarks)])
 
 
 def _shown(value: Any) -> str:

@@ -36,7 +36,6 @@ from bidnerf_core.mapping import (
     BakeConfig,
     TrackedViews,
     find_features,
-    track_views,
 )
 from bidnerf_core.maps.description import DESCRIPTION, MapInfo, load_info, longest_side
 from bidnerf_core.maps.map import USUAL_BAKE, Map, load_map
@@ -245,16 +244,16 @@ def report_finished_parts(folder: Path | None) -> Iterator[None]:
     try:
         yield
     except Cancelled as stopped:
-        try:
+        info = None
+        with contextlib.suppress(InputError):
             info = None if folder is None else load_info(folder)
-        except InputError:
-            info = None
         if info is None or isinstance(stopped.__cause__, TrainingStopped):
             raise
         there = {"landmarks": info.landmarks, "field": info.step, "surface": info.surface}
         parts = enumeration([part for part, found in there.items() if found]) or "nothing"
-        advice = "--resume continues, --finish ends it as it is"
-        raise Cancelled(f"{folder}: {stopped}; the map has its {parts} so far; {advice}") from stopped
+        raise Cancelled(
+            f"{folder}: {stopped}; the map has its {parts} so far; --resume continues, --finish ends it as it is"
+        ) from stopped
 
 
 def resume(
@@ -398,8 +397,6 @@ def _complete(
     """
     if baking is not None and scene.landmarks is None:
         scene, tracked = scene.with_landmarks(views, tracked=tracked)
-    elif baking is not None and tracked is None and scene.info.capture is None:
-        tracked = track_views(views, scene.info.landmark_features)
     scene = replace(scene, folder=out or scene.folder)
     if not scene.info.complete:
         scene = train_field(views, scene, options, state)
@@ -408,8 +405,10 @@ def _complete(
             scene = bake_if_possible(scene, lambda whole: whole.with_surface(views, baking))
         scene = scene.with_survey(views, tracked)
     if scene.folder is not None:
-        size = sum(file.stat().st_size for file in scene.folder.iterdir()) / 2**20
-        log.info(f"{scene.folder}: map of {scene.info.data or 'views in memory'}, {size:.1f} MiB")
+        log.info(
+            f"{scene.folder}: map of {scene.info.data or 'views in memory'},"
+            f" {sum(file.stat().st_size for file in scene.folder.iterdir()) / 2**20:.1f} MiB"
+        )
     return scene
 
 

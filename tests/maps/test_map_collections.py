@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from bidnerf.testing import BOUNDS, CAMERA, POSES, ground, view
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.fields import NoField
+from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import BakeConfig, bake, build_landmarks
 from bidnerf_core.mapping.landmarks.vocabulary import visible
 from bidnerf_core.maps import Map, MapInfo, maps_in, name_maps
@@ -138,7 +140,9 @@ def test_the_limit_counts_only_maps_that_can_be_compared(grounds: list[Map], mon
     """Maps without landmarks cannot be ranked, so that any of them may be the one that the image shows."""
     bare = {f"bare{n}": grounds[2] for n in range(7)}
     maps = bn.MapCollection({**bare, "ground0": grounds[0], "ground4": grounds[1]}, limit=1)
-    none = collections_module._no_localization("nothing matches", "auto")
+    T = SE3.identity()
+    nothing = "nothing matches", 0, 0.0, math.nan, "auto", SE3.stack([T]), torch.zeros(0, dtype=torch.float64)
+    none = bn.Localization(T, bn.Outcome.TOO_FEW_MATCHES, *nothing)
     monkeypatch.setattr(maps, "_by_landmarks", lambda *_: none)
     monkeypatch.setattr(maps, "localizer", lambda name: lambda frame, seed: none)
     assert maps(photo(SEEDS[1]).frame).tried == ("ground4", *bare)

@@ -14,11 +14,12 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from bidnerf_core.camera import CameraSource
+from bidnerf_core.camera import WAYS, CameraSource
 from bidnerf_core.datasets.capture import Capture, Colour, Shot
 from bidnerf_core.datasets.reader import DatasetOptions, Format
 from bidnerf_core.datasets.video import VIDEO_SUFFIXES, Video, VideoPicture, is_video
 from bidnerf_core.depth import MILLIMETRE, DepthCamera
+from bidnerf_core.errors import InputError
 from bidnerf_core.frames import BLACK, DEPTH_STEM, Frame, photos_in
 
 
@@ -66,10 +67,6 @@ def _read(path: Path, photos: list[Path], options: DatasetOptions) -> Capture:
     return Capture(path, shots, options.colour)
 
 
-def _find(path: Path) -> list[Path]:
-    return photos_in(path)[0] if path.is_dir() else []
-
-
 def timestamp(stem: str) -> float | None:
     """Return the time (seconds) in a file name such as ``1305031102.175304.png``; None for names without a fraction."""
     return float(stem) if re.fullmatch(r"\d+\.\d+", stem) else None
@@ -78,7 +75,8 @@ def timestamp(stem: str) -> float | None:
 def _read_video(path: Path, is_video: bool, options: DatasetOptions) -> Capture:
     """List the frames of a video. Raises ``InputError`` if the file is not a video, and if there is no camera."""
     source, video = options.camera_source, Video(path)
-    source.require(path, "a video does not record its focal length")
+    if not source.is_given and not source.assumed:
+        raise InputError("a video does not record its focal length", where=path, expected=f"a camera: {WAYS}")
     shots = [
         Shot(
             image=VideoPicture(video, number, is_upright=True),
@@ -95,7 +93,7 @@ def _read_video(path: Path, is_video: bool, options: DatasetOptions) -> Capture:
 reader = Format(
     "images without poses; the depth of NAME.png is NAME.depth.png, in millimetres",
     "image files",
-    _find,
+    lambda path: photos_in(path)[0] if path.is_dir() else [],
     _read,
     ("camera", "focal", "register_depth", "depth_unit"),
 )

@@ -86,10 +86,6 @@ def _read(path: Path, files: list[Path], options: DatasetOptions) -> Capture:
     )
 
 
-def _find(path: Path) -> list[Path]:
-    return [path / name for name in ("transforms.json", *SPLIT_FILES.values()) if is_file(path / name)]
-
-
 def _check_images(folder: Path, frames: Sequence[FrameRecord], images: Sequence[Path]) -> None:
     """Issue one remark if names differ from the file names by more than a missing extension.
 
@@ -124,8 +120,11 @@ def _first_size(frames: Sequence[FrameRecord], images: Sequence[Path]) -> tuple[
             continue
         given = frame.camera.width or size[0], frame.camera.height or size[1]
         if given != size and same_aspect(given, size):
-            expected = f"w and h are {given[0]}x{given[1]}; cameras are scaled to the images"
-            warn_about(frame.record.where, f"{image.name} is {size[0]}x{size[1]}, but {expected}")
+            warn_about(
+                frame.record.where,
+                f"{image.name} is {size[0]}x{size[1]}, but w and h are {given[0]}x{given[1]}; cameras are scaled to the"
+                " images",
+            )
         return size
     return None
 
@@ -142,7 +141,7 @@ def _header(image: Path) -> tuple[tuple[int, int] | None, bool]:
 reader = Format(
     "NeRF-Synthetic, nerfstudio, instant-ngp, NeRFCapture, KIRI Engine, and datasets that bidnerf writes",
     "transforms.json or transforms_train.json, transforms_val.json, transforms_test.json",
-    _find,
+    lambda path: [path / name for name in ("transforms.json", *SPLIT_FILES.values()) if is_file(path / name)],
     _read,
     ["depth_unit"],
     precedence=50,  # datasets of other formats are converted to this one in place

@@ -102,10 +102,6 @@ def _read(path: Path, colour_list: Path, options: DatasetOptions) -> Capture:
     )
 
 
-def _find(path: Path) -> Path | None:
-    return first_file(path, "rgb.txt")
-
-
 def _published_camera(name: str, whole: bool = False) -> Intrinsics | None:
     """Return the benchmark's calibration of the sensor that ``name`` contains (or is, with ``whole``), or None."""
     sensor = re.compile(r"(?:freiburg|fr)_?([123])(?!\d)", re.IGNORECASE)
@@ -136,7 +132,7 @@ def associate(times: Sequence[float], others: Sequence[float], largest: float) -
 reader = Format(
     "TUM RGB-D: poses interpolated, depth nearest in time, in steps of 1/5000 m",
     "rgb.txt with depth.txt and groundtruth.txt (TUM RGB-D)",
-    _find,
+    lambda path: first_file(path, "rgb.txt"),
     _read,
     ("camera", "register_depth", "depth_unit"),
     precedence=40,  # recordings of other formats get these lists for SLAM programs

@@ -31,22 +31,22 @@ DEGREES = {3 * (count - 1): degree for degree, count in COEFFICIENTS.items()}
 def recognises(path: Path) -> bool:
     """Return whether the file is a PLY with the properties of the original 3DGS code."""
     header = _header(path)
-    vertex = None if header is None else header.element("vertex")
-    return vertex is not None and {"opacity", "scale_0", "rot_0"} <= set(vertex.names)
+    vertex = None if header is None else header.elements.get("vertex")
+    return vertex is not None and {"opacity", "scale_0", "rot_0"} <= set(vertex.properties)
 
 
 def recognises_discs(path: Path) -> bool:
     """Return whether the file is a PLY of 2D Gaussian Splatting (Huang et al. 2024), whose splats have two scales."""
     header = _header(path) if recognises(path) else None
-    vertex = None if header is None else header.element("vertex")
-    return vertex is not None and "scale_1" in vertex.names and "scale_2" not in vertex.names
+    vertex = None if header is None else header.elements.get("vertex")
+    return vertex is not None and "scale_1" in vertex.properties and "scale_2" not in vertex.properties
 
 
 def recognises_compressed(path: Path) -> bool:
     """Return whether the file is a compressed PlayCanvas PLY."""
     header = _header(path)
-    vertex = None if header is None else header.element("vertex")
-    return vertex is not None and "packed_position" in vertex.names
+    vertex = None if header is None else header.elements.get("vertex")
+    return vertex is not None and "packed_position" in vertex.properties
 
 
 def _header(path: Path) -> PlyHeader | None:

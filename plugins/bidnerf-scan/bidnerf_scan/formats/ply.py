@@ -26,15 +26,15 @@ def recognises(path: Path) -> bool:
     except InputError:  # reported when it is read
         with path.open("rb") as file:
             return file.read(3) == b"ply"
-    vertex = header.element("vertex")
-    return vertex is None or not any(splat <= set(vertex.names) for splat in SPLATS)
+    vertex = header.elements.get("vertex")
+    return vertex is None or not any(splat <= set(vertex.properties) for splat in SPLATS)
 
 
 def read(path: Path) -> Scan:
     """Return the mesh or the points of a PLY file."""
     header = read_ply_header(path, EXPECTED)
-    vertex, face = header.element("vertex"), header.element("face")
-    if vertex is None or not {"x", "y", "z"} <= set(vertex.names):
+    vertex, face = header.elements.get("vertex"), header.elements.get("face")
+    if vertex is None or not {"x", "y", "z"} <= set(vertex.properties):
         raise InputError("no vertices with x, y and z", where=path, expected=EXPECTED)
     if vertex.count == 0:
         raise InputError("holds no vertices", where=path, expected=EXPECTED)
