@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -19,6 +20,7 @@ from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, Similarity, scale_point
 from bidnerf_core.io import parse_record, read_file, write_file
+from bidnerf_core.settings import Range, Settings
 
 MatrixRows = tuple[tuple[float, float, float, float], ...]
 """The rows of a 4x4 matrix."""
@@ -81,18 +83,15 @@ class MovedCamera:
 
 
 @dataclass(frozen=True)
-class PoseRefinement:
+class PoseRefinement(Settings):
     """How well the given and the adjusted poses fit the keypoints that images share, and which poses training used."""
 
-    noise_before: float  # pixels: standard deviation of reprojection errors at the given poses
-    noise_after: float
+    noise_before: Annotated[
+        float, Range(0, 1e6)
+    ]  # pixels: standard deviation of reprojection errors at the given poses
+    noise_after: Annotated[float, Range(0, 1e6)]
     refined: bool = False  # whether training used the adjusted poses
     replaced: tuple[str, ...] = ()  # images with a wrong given pose, localized with the others' landmarks
-
-    def __post_init__(self) -> None:
-        for value in (self.noise_before, self.noise_after):
-            if not 0 <= value <= 1e6:
-                raise InputError(f"the keypoint noise is {value}", expected="0 to 1e+06 pixels")
 
     @property
     def inconsistency(self) -> float:

@@ -133,8 +133,9 @@ def _by_own_landmarks(
     for number, update in updates.items():
         own = scatter * max(1.0, usual / float(count[number]))
         deviations = float((update @ torch.linalg.pinv(own, hermitian=True) @ update).clamp(min=0).sqrt())
-        pixels = image_motion(update, views[number], float(depth[image == number].median()))
-        relocations[number] = Relocation(update, deviations, pixels)
+        relocations[number] = Relocation(
+            update, deviations, image_motion(update, views[number], float(depth[image == number].median()))
+        )
     return relocations
 
 

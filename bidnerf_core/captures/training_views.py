@@ -107,8 +107,9 @@ def prepare_views(
     cameras = record_refinement(views, stored_cameras(moved), fit.pixels.tolist())
     summary = None
     if fit.consistency is not None:
-        names = tuple(views[number].frame.name for number in fit.replaced)
-        summary = replace(fit.consistency, refined=fit.refined, replaced=names)
+        summary = replace(
+            fit.consistency, refined=fit.refined, replaced=tuple(views[number].frame.name for number in fit.replaced)
+        )
         for line in pose_sentences(cameras, summary):
             log.info(line)
     elif refinement == "always" or len(views) >= ENOUGH_IMAGES:

@@ -100,8 +100,9 @@ def read_capture(
                 f"the dataset has {sum(posed)} of {amount(len(posed), 'frame')}, {capture.rate:g} per second; the"
                 " sequence has all",
             )
-    faces = [replace(face, name="") for shot in shots for face in shot.faces()]
-    capture = replace(capture, shots=faces, largest=options.largest)
+    capture = replace(
+        capture, shots=[replace(face, name="") for shot in shots for face in shot.faces()], largest=options.largest
+    )
     masks = options.mask_folder
     capture = capture if masks is None else capture.with_masks(masks)
     return capture.in_time_order() if in_time_order else capture.require_poses()

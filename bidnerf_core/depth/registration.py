@@ -40,8 +40,9 @@ class DepthCamera:
             raise record.error(
                 "describes a lens that is not perspective", expected="the intrinsics of the depth camera"
             )
-        T = rigid_pose(torch.tensor(rows, dtype=torch.float64), path, f"the rotation of {EXTRINSICS}")
-        return DepthCamera(camera, T)
+        return DepthCamera(
+            camera, rigid_pose(torch.tensor(rows, dtype=torch.float64), path, f"the rotation of {EXTRINSICS}")
+        )
 
     def register(self, depth: Float[Tensor, "dh dw"], colour: Intrinsics, file: Path | str) -> Float[Tensor, "h w"]:
         """Register depth to the colour camera (planar z, metres); error messages begin with ``file``.

@@ -285,8 +285,9 @@ def _adapter(kind: Any) -> TypeAdapter[list[Any]]:
     """Return a validator of lists of ``kind``: pydantic accepts a configuration only for dataclasses nested in other types."""
     from pydantic import ConfigDict, TypeAdapter
 
-    strict = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
-    return TypeAdapter(list[kind], config=strict)
+    return TypeAdapter(
+        list[kind], config=ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
+    )
 
 
 def _first_error(errors: Sequence[Any], where: str, of: Any, value: Any) -> InputError:

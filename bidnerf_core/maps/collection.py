@@ -205,8 +205,9 @@ class MapCollection:
             count(number, len(self._maps))
         keys = {name: (found.features, found.descriptors.shape[1]) for name, found in landmarks.items()}
         for key in dict.fromkeys(keys.values()):
-            same = [found.descriptors for name, found in landmarks.items() if keys[name] == key]
-            self._vocabularies[key] = Vocabulary.of(same)
+            self._vocabularies[key] = Vocabulary.of(
+                [found.descriptors for name, found in landmarks.items() if keys[name] == key]
+            )
         for name, found in landmarks.items():
             self._pooled_views[name] = pool_views(self._vocabularies[keys[name]], found, cameras_of(self._infos[name]))
         if bare := [name for name in self._maps if name not in landmarks]:

@@ -191,8 +191,9 @@ def load_info(folder: Path) -> MapInfo:
         found = {key: value for key, value in found.items() if key not in unknown}
     info = from_plain(MapInfo, found, str(path))
     if (folder / ANCHOR).exists():
-        anchor = from_plain(Anchor, read_json(folder / ANCHOR, "the anchor of a map"), str(folder / ANCHOR))
-        info = replace(info, anchor=anchor)
+        info = replace(
+            info, anchor=from_plain(Anchor, read_json(folder / ANCHOR, "the anchor of a map"), str(folder / ANCHOR))
+        )
     for name in cameras_with_invalid_pose(info.cameras):
         raise InputError(f"pose of camera {name!r} is not a rigid transform", where=path, expected="4x4 rows")
     return info

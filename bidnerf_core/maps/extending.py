@@ -293,8 +293,9 @@ def _train_further(scene: Map, views: Sequence[View], steps: int | None, share: 
     if info.field_frame is not None:
         views = [_in_field_unit(view, 1 / info.field_frame.scale) for view in views]
     restarted = replace(info, step=0, complete=False, config=to_plain(settings, "config"))
-    options = TrainOptions(device=device_of(scene.field))
-    grown = train_field(views, Map(restarted, NoField()), options, weights=field.state_dict())
+    grown = train_field(
+        views, Map(restarted, NoField()), TrainOptions(device=device_of(scene.field)), weights=field.state_dict()
+    )
     info = replace(info, step=info.step + grown.info.step, seconds=grown.info.seconds)
     return replace(scene, info=info, field=grown.field, folder=None, record=scene.capture)
 

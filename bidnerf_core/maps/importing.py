@@ -162,8 +162,9 @@ def import_map(
                 text = f"{where}: {text} The poses of the photos would have to be scaled as well"
                 warnings.warn(text, InputWarning, stacklevel=2)
         if folder is not None:
-            state = TrainingState(step, found.tensors, {})
-            scene = replace(scene, info=write_parts(folder, scene.info, state), folder=folder)
+            scene = replace(
+                scene, info=write_parts(folder, scene.info, TrainingState(step, found.tensors, {})), folder=folder
+            )
         if baking is None:
             return scene
         return bake_if_possible(scene, lambda scene: _bake(scene, found, views, baking))
@@ -174,8 +175,9 @@ def _of_structure(
 ) -> Map:
     """Build a landmark-only map from posed images and the points that they observe."""
     capture, features = structure.capture, options.features
-    T_world_camera = SE3.stack([shot.T_world_camera for shot in capture.shots if shot.T_world_camera])
-    origin = choose_origin(T_world_camera.translation)
+    origin = choose_origin(
+        SE3.stack([shot.T_world_camera for shot in capture.shots if shot.T_world_camera]).translation
+    )
     offset = -torch.tensor(origin, dtype=torch.float64)
     unit: LengthUnit = "metres" if options.scale != 1 else "units"
     tracked = None

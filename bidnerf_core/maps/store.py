@@ -270,8 +270,9 @@ def read_part(folder: Path, info: MapInfo, part: str) -> Any:
 
 def with_images(landmarks: LandmarkMap, info: MapInfo) -> LandmarkMap:
     """Return the landmarks with the cameras and the detector name that the map's description records."""
-    cameras = tuple(camera.intrinsics for camera in info.cameras)
-    return replace(landmarks, cameras=cameras, features=info.landmark_features)
+    return replace(
+        landmarks, cameras=tuple(camera.intrinsics for camera in info.cameras), features=info.landmark_features
+    )
 
 
 def with_tracks_in(info: MapInfo, landmarks: LandmarkMap, names: Sequence[str]) -> LandmarkMap:
@@ -279,8 +280,9 @@ def with_tracks_in(info: MapInfo, landmarks: LandmarkMap, names: Sequence[str]) 
     if landmarks.tracks is None:
         return landmarks
     numbers = {camera.name: number for number, camera in enumerate(info.cameras)}
-    images = torch.tensor([numbers.get(name, -1) for name in names])
-    return replace(landmarks, tracks=landmarks.tracks.renumber(images=images))
+    return replace(
+        landmarks, tracks=landmarks.tracks.renumber(images=torch.tensor([numbers.get(name, -1) for name in names]))
+    )
 
 
 def check_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) -> dict[str, Tensor]:

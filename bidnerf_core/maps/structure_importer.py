@@ -100,8 +100,9 @@ class StructureImporter:
             tuple(observed[number] for number in usable),
             tuple(known[images[number].name] for number in usable) if known else (),
         )
-        bounds = bounds_about(positions[sound])
-        return ImportedField("", None, {}, bounds, found=tuple(found), steps=0, structure=structure)
+        return ImportedField(
+            "", None, {}, bounds_about(positions[sound]), found=tuple(found), steps=0, structure=structure
+        )
 
 
 def _numbers(observed: Tensor, ids: Tensor, sound: Tensor) -> Tensor:

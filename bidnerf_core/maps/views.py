@@ -84,8 +84,9 @@ class ReadViews:
         if not any(origin):
             return self
         offset = -torch.tensor(origin, dtype=torch.float64)
-        views = [replace(view, T_ref_camera=view.T_ref_camera.translated(offset)) for view in self.views]
-        return replace(self, views=views)
+        return replace(
+            self, views=[replace(view, T_ref_camera=view.T_ref_camera.translated(offset)) for view in self.views]
+        )
 
     def with_files(self, cameras: Sequence[StoredCamera]) -> tuple[StoredCamera, ...]:
         """Return the cameras of the views, with the file of each image.

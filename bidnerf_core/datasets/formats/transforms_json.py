@@ -128,8 +128,9 @@ def _frame(file: Record, number: int, entry: object) -> FrameRecord:
         raise own.error("no file_path", expected="the name of its image")
     record = Record(f"{where} ({path})", entry, file)
     posed, masked = pose_and_scale(Record(record.where, entry)), posix_name(mask) if mask else None
-    camera, depth = camera_record(record), _depth(record, own)
-    return FrameRecord(record, posix_name(path), camera, *posed, *depth, _time(own), masked)
+    return FrameRecord(
+        record, posix_name(path), camera_record(record), *posed, *_depth(record, own), _time(own), masked
+    )
 
 
 def _depth(record: Record, own: Record) -> tuple[PurePosixPath | None, float]:

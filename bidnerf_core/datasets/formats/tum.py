@@ -89,7 +89,6 @@ def _read(path: Path, colour_list: Path, options: DatasetOptions) -> Capture:
                 depth=None if depth is None else DepthFile(depth, partial(read_depth, depth, unit), sensor),
             )
         )
-    samples = f"samples before and after the times of images, at most {LARGEST_GAP:g} s apart"
     return Capture(
         path,
         shots,
@@ -97,7 +96,9 @@ def _read(path: Path, colour_list: Path, options: DatasetOptions) -> Capture:
         unit="metres",
         depth_unit=unit,
         pose_file=truth,
-        poses_expected="the poses of the frames of a dataset" if trajectory is None else samples,
+        poses_expected="the poses of the frames of a dataset"
+        if trajectory is None
+        else f"samples before and after the times of images, at most {LARGEST_GAP:g} s apart",
         unposed=f"before its first pose, after its last, or in gaps of more than {LARGEST_GAP:g} s",
     )
 
