@@ -117,8 +117,10 @@ def capture_graph(
         except RuntimeError as error:  # the step waits for the device somewhere, as a third-party field may
             if generator is not None and before is not None:
                 generator.graphsafe_set_state(before)  # the registered one still expects a capture
-            why = str(error).partition("\n")[0]
-            warnings.warn(f"operations are launched one by one, since a step cannot be captured: {why}", stacklevel=2)
+            warnings.warn(
+                "operations are launched one by one, since a step cannot be captured: " + str(error).partition("\n")[0],
+                stacklevel=2,
+            )
             return step
         finally:  # by identity, since two empty lists are equal
             _notes[:] = [notes for notes in _notes if notes is not constants]

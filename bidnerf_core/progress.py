@@ -56,11 +56,10 @@ def job_context(progress: ProgressCallback | None = None, cancel: Cancel | None 
     ``counter`` and stop in ``check_cancelled``. A callback that is None is inherited from the enclosing block. Raises ``InputError``
     if a callback is not callable (for example, if ``cancel`` is an event rather than its ``is_set``).
     """
-    kinds = {
-        "cancel": "a function, such as the is_set of an event",
-        "progress": "a function that takes a Progress",
-    }
-    for (name, expected), given in zip(kinds.items(), (cancel, progress), strict=True):
+    for name, given, expected in (
+        ("cancel", cancel, "a function, such as the is_set of an event"),
+        ("progress", progress, "a function that takes a Progress"),
+    ):
         if given is not None and not callable(given):
             raise InputError(f"{name} is a {type(given).__name__}", expected=expected)
     outer = _JOB.get()
@@ -85,11 +84,7 @@ def check_cancelled(stage: str = "localization") -> None:
 
 def counter(stage: str, unit: str) -> Callable[[int, int], None]:
     """Return a function of (done, total) that reports to the current job, and raises ``Cancelled`` if the job should stop."""
-
-    def count(done: int, total: int) -> None:
-        report_progress(Progress(stage, done, total, unit))
-
-    return count
+    return lambda done, total: report_progress(Progress(stage, done, total, unit))
 
 
 def report_progress(progress: Progress) -> None:

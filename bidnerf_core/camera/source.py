@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
@@ -136,16 +136,18 @@ class CameraSource:
             return replace(resolved, approximate=True)
         if isinstance(camera, Intrinsics | Lens):
             return _fit(str(where), raster, camera, "camera as given")
-        expected = "Intrinsics or the path of a camera file"
-        if getattr(camera, "shape", None) == (3, 3):
-            expected += "; Intrinsics.from_opencv(K, distortion, (width, height)) makes them from a matrix"
         if not isinstance(camera, str | Path):
-            raise InputError(f"camera is a {type(camera).__name__}", where=where, expected=expected)
+            raise InputError(
+                f"camera is a {type(camera).__name__}",
+                where=where,
+                expected="Intrinsics or the path of a camera file"
+                + (
+                    "; Intrinsics.from_opencv(K, distortion, (width, height)) makes them from a matrix"
+                    if getattr(camera, "shape", None) == (3, 3)
+                    else ""
+                ),
+            )
         return _fit(str(where), raster, read_camera(Path(camera), size, str(where)), f"camera of {camera}")
-
-    def at(self, image: Path) -> Callable[[int, int], Camera]:
-        """Return a function that finds the camera of the file ``image`` from its width and height, without EXIF."""
-        return lambda width, height: self.find(image, Raster(width, height)).camera
 
 
 def folder_camera(
@@ -184,11 +186,12 @@ def _fit(where: str, raster: Raster, given: Camera, origin: str) -> ResolvedCame
     fitted = raster.upright(given)
     if fitted is None:
         size = "x".join(map(str, raster.upright_size))
-        expected = "one with the same aspect ratio"
-        if same_aspect((given.height, given.width), raster.size):
-            expected = "images that are not turned by a quarter against their cameras: export them as stored"
         raise InputError(
-            f"image is {size}, but its camera is for {given.width}x{given.height}", where=where, expected=expected
+            f"image is {size}, but its camera is for {given.width}x{given.height}",
+            where=where,
+            expected="images that are not turned by a quarter against their cameras: export them as stored"
+            if same_aspect((given.height, given.width), raster.size)
+            else "one with the same aspect ratio",
         )
     return ResolvedCamera(fitted, f"{origin}: {fitted.sentence}")
 

@@ -189,8 +189,9 @@ def pose_sentences(cameras: Sequence[StoredCamera], refinement: PoseRefinement) 
         )
     if wrong:
         more = f" and {len(wrong) - 6} more" if len(wrong) > 6 else ""
-        listed = ", ".join(map(str, wrong[:6]))
-        lines.append(f"moved to the poses given by the landmarks of the other images: {listed}{more}")
+        lines.append(
+            f"moved to the poses given by the landmarks of the other images: {', '.join(map(str, wrong[:6]))}{more}"
+        )
     return lines
 
 
@@ -264,7 +265,10 @@ def cameras_beside(path: Path, placement: Similarity) -> tuple[StoredCamera, ...
             rows = _rows(SE3(placement.T_target_source.rotation.double() @ rotation, placement.apply(position)))
             cameras.append(StoredCamera(str(entry["img_name"]), camera, rows))
     except (InputError, KeyError, TypeError, ValueError, RuntimeError) as error:
-        message = f"{file}: camera {len(cameras)} is not readable in Inria's layout ({error}); ignored"
-        warnings.warn(message, InputWarning, stacklevel=2)
+        warnings.warn(
+            f"{file}: camera {len(cameras)} is not readable in Inria's layout ({error}); ignored",
+            InputWarning,
+            stacklevel=2,
+        )
         return ()
     return tuple(cameras)

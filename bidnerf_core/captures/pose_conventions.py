@@ -79,7 +79,10 @@ class PoseContradiction:
 
 def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | None:
     """Return how the poses of ``images`` contradict the images; None if they agree, or if the images are inconclusive."""
-    proposed = _pairs(images)
+    # Images overlap that are neighbours according to the poses, which may be wrong, or in the order of ``images``.
+    near = [(i, j) for i, j in likely_pairs([image.T_ref_camera for image in images], 2).tolist()]
+    ordered = sorted({*near, *((i, i + step) for step in (1, 3) for i in range(len(images) - step))})
+    proposed = ordered[:: max(1, -(-len(ordered) // MOST_PAIRS))]
     pairs = [pair for i, j in proposed if (pair := match_pair(images, i, j)) is not None]
     if len(pairs) < MOST_PAIRS / 2:
         others = [pair for pair in _similar(images) if pair not in proposed][:MOST_PAIRS]
@@ -105,7 +108,6 @@ def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | 
         return None
     # Two images that do not agree with each other, but each with a neighbour, show places that look alike.
     disputes = [{pair.first, pair.second} for pair, agreed in zip(pairs, agrees, strict=True) if not agreed]
-    near = likely_pairs([image.T_ref_camera for image in images], 2).tolist()
     nearby = [match_pair(images, i, j) for i, j in near if any({i, j} & both for both in disputes)]
     sound = {i for pair in nearby if pair and bool(pair.agreeing(poses[None])[0]) for i in (pair.first, pair.second)}
     alike = sum(both <= sound for both in disputes)
@@ -148,19 +150,6 @@ class MatchedPair:
         shows = torch.linalg.vector_norm(normal, dim=-1) / lengths > 3 * self.pixel
         front = ((a > 0) & (b > 0) & shows).sum(-1)
         return near & ((shows.sum(-1) < 10) | (front >= AGREED * shows.sum(-1)) | at_rest)
-
-
-def _pairs(images: Sequence[ImageKeypoints]) -> list[tuple[int, int]]:
-    """Return pairs of images that probably overlap.
-
-    The images of a pair are neighbours according to the poses, which may be wrong, or in the order of ``images``.
-    """
-    count = len(images)
-    pairs = {(i, i + step) for step in (1, 3) for i in range(count - step)}
-    near = likely_pairs([image.T_ref_camera for image in images], 2)
-    pairs |= {(i, j) for i, j in near.tolist()}
-    ordered = sorted(pairs)
-    return ordered[:: max(1, -(-len(ordered) // MOST_PAIRS))]
 
 
 def _similar(images: Sequence[ImageKeypoints]) -> list[tuple[int, int]]:

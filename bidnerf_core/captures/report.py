@@ -148,12 +148,12 @@ def sentences(report: CaptureReport) -> list[str]:
     heights = f", {low:.0f}° to {high:.0f}° above the horizon" if is_outside else ""
     if covered.arrangement == "inside":
         heights = f", looking {low:.0f}° to {high:.0f}° up"
-    landmarks = "no landmark seen by several of them could be triangulated"
-    if covered.landmarks:
-        landmarks = (
-            f"{covered.landmarks} triangulated landmarks, typically seen in {covered.seen_by:.0f}"
-            f" photos within {covered.seen_within_deg:.0f}°"
-        )
+    landmarks = (
+        f"{covered.landmarks} triangulated landmarks, typically seen in {covered.seen_by:.0f}"
+        f" photos within {covered.seen_within_deg:.0f}°"
+        if covered.landmarks
+        else "no landmark seen by several of them could be triangulated"
+    )
     errors = f", median error {trial.translation:.3g} and {trial.rotation_deg:.2g}°" if trial.found else ""
     remarks = [
         (True, f"{photos}, {ARRANGEMENTS[covered.arrangement]}{heights}; {landmarks}"),
@@ -171,8 +171,9 @@ def sentences(report: CaptureReport) -> list[str]:
     for problem, (what, advice) in PROBLEMS.items():
         names = [photo.name for photo in report.photos if problem in photo.problems]
         more = f" and {len(names) - 6} more" if len(names) > 6 else ""
-        are = "is" if len(names) == 1 else "are"
-        remarks.append((bool(names), f"{', '.join(names[:6])}{more} {are} {what}: {advice}"))
+        remarks.append(
+            (bool(names), f"{', '.join(names[:6])}{more} {'is' if len(names) == 1 else 'are'} {what}: {advice}")
+        )
     remarks.append((few, f"{photos}: hardly enough for a map; take twenty or more, with much overlap"))
     dark = [photo.name for photo in report.photos if photo.exposure is None]
     unknown = bool(dark) and len(dark) < len(report.photos)

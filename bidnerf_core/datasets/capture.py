@@ -137,7 +137,7 @@ class Shot:
             rgb, alpha = read_compact_image(self.image, background, None if size == raster.size else size)
         elif pixels is not None:
             rgb, alpha = pixels if size == raster.size else reduce_image(pixels, *size), None
-        metres, hidden, about = None, None, dict[str, Any]()
+        metres, hidden = None, None
         if self.depth is not None:
             measured, where = self.depth.read(), Path(self.depth.path)
             metres = (
@@ -150,9 +150,8 @@ class Shot:
             hidden = torch.ones(rgb.shape[:2], dtype=torch.bool)
             hidden[width:-width, width:-width] = False
             hidden = None if bool(hidden.all()) else hidden
-        if self.tells_camera:
-            about = {"camera_source": found.description, "focal_is_approximate": found.approximate}
-        return Frame.taken(self.name, camera, rgb, metres, alpha, hidden, **about)
+        about: dict[str, Any] = {"camera_source": found.description, "focal_is_approximate": found.approximate}
+        return Frame.taken(self.name, camera, rgb, metres, alpha, hidden, **(about if self.tells_camera else {}))
 
     def read(self, background: Colour = BLACK, side: int | None = None) -> Frame:
         """Read the frame and apply its masks. Raises ``WhollyHidden`` if they hide every pixel."""
@@ -244,11 +243,6 @@ class Capture:
     def names(self) -> list[str]:
         return [shot.name for shot in self.shots]
 
-    @property
-    def times(self) -> list[float | None]:
-        """The frames' timestamps (seconds); None where unknown."""
-        return [shot.time for shot in self.shots]
-
     def __len__(self) -> int:
         return len(self.shots)
 
@@ -270,10 +264,6 @@ class Capture:
     @cached_property
     def _by_split(self) -> dict[str, Capture]:
         return {}  # filled by ``split``, since naming the frames of a large split takes long
-
-    @cached_property
-    def _by_name(self) -> dict[str, Shot]:
-        return {shot.name: shot for shot in self.shots}
 
     def split(self, name: str) -> Capture:
         """Return the frames of a split; "all" has every frame that is in a split. Raises ``InputError`` for an unknown split."""
@@ -327,11 +317,12 @@ class Capture:
     def select(self, split: str, names: Sequence[str] | None = None) -> list[Shot]:
         """Return the frames ``names`` of a split, in that order, or the whole split. Raises ``InputError`` for an unknown split or name."""
         part, where = self.split(split), f"{self.path}: split {split!r}"
-        chosen, by_name = list(part.shots), part._by_name
+        chosen = list(part.shots)
         if names is None:
             return chosen
         if isinstance(names, str):  # its letters would be taken for names
             raise InputError(f"names is {names!r}", where=where, expected=f"a list, such as [{names!r}]")
+        by_name = {shot.name: shot for shot in chosen}
         unknown = next((name for name in names if name not in by_name), None)
         if unknown is None:
             return [by_name[name] for name in names]
@@ -485,8 +476,11 @@ def drop_missing_files(capture: Capture) -> list[Shot]:
             raise InputError(f"no such {noun}, although {capture.path} lists it", where=gone[0])
         if gone:
             first = gone[0].relative_to(capture.path) if gone[0].is_relative_to(capture.path) else gone[0]
-            count = f"{len(gone)} of {amount(len(files), noun)} {'is' if len(gone) == 1 else 'are'}"
-            warn_about(capture.path, f"{count} missing and left out, first: {first}")
+            warn_about(
+                capture.path,
+                f"{len(gone)} of {amount(len(files), noun)} {'is' if len(gone) == 1 else 'are'} missing and left out,"
+                f" first: {first}",
+            )
         return set(gone)
 
     gone = missing("image", [shot.image for shot in capture.shots])

@@ -115,8 +115,7 @@ class SparsePoints:
     def summary(self) -> str:
         """A one-line description of the model's unit."""
         checked = f", positions agree to {self.misfit:.2%} of their spread" if self.cameras > 2 else ", unchecked"
-        unit = f"its unit is {self.metres:.4g} m according to {self.cameras} training cameras{checked}"
-        return f"{self.folder}: {unit}"
+        return f"{self.folder}: its unit is {self.metres:.4g} m according to {self.cameras} training cameras{checked}"
 
     def seen(self, name: str, split: str) -> Float[Tensor, "n 3"]:
         """Return the points that a frame observes (metres, camera frame); empty if the frame is not in the model."""

@@ -206,9 +206,8 @@ def _binary(path: Path, columns: _Columns) -> Iterator[_Entry]:
     if count > len(content) - 8:
         raise InputError(f"declares {count} entries in {len(content) - 8} bytes; is the file damaged?", where=path)
     for _ in range(count):
-        numbers, name = list(unpack(columns.numbers)), b""
-        if columns.item_text:
-            name = b"".join(iter(partial(take, 1), b"\0"))
+        numbers = list(unpack(columns.numbers))
+        name = b"".join(iter(partial(take, 1), b"\0")) if columns.item_text else b""
         length = unpack("Q")[0] if columns.length is None else columns.length(path, numbers)
         items = np.frombuffer(take(length * columns.item.itemsize), columns.item)
         yield str(path), numbers, name.decode("utf-8", "replace"), items[columns.item.names[-1]]  # type: ignore[index]

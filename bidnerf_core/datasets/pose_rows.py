@@ -48,7 +48,7 @@ def pose_and_scale(record: Record, key: str = "transform_matrix") -> tuple[SE3, 
     if size > 0 and abs(size - 1) > RIGID_TO / 2:
         matrix = torch.cat([matrix[:, :3] / size, matrix[:, 3:]], dim=1)
         scale *= size
-    return _from_opengl(record, key, matrix.tolist()), scale
+    return pose_of_rows(record, key, matrix.tolist()), scale
 
 
 def pose_of_rows(record: Record, key: str, rows: list[Any] | None) -> SE3:
@@ -56,10 +56,6 @@ def pose_of_rows(record: Record, key: str, rows: list[Any] | None) -> SE3:
 
     ``key`` is the key of ``rows`` in ``record``, for messages. Raises ``InputError`` for any other matrix.
     """
-    return _from_opengl(record, key, record.matrix(key, rows))
-
-
-def _from_opengl(record: Record, key: str, rows: list[list[float]]) -> SE3:
-    """Convert a pose from OpenGL to OpenCV axes: y up becomes y down, z backward becomes z forward."""
-    matrix = torch.tensor(rows, dtype=torch.float64) * torch.tensor([1.0, -1.0, -1.0, 1.0])
+    # y up becomes y down, z backward becomes z forward.
+    matrix = torch.tensor(record.matrix(key, rows), dtype=torch.float64) * torch.tensor([1.0, -1.0, -1.0, 1.0])
     return rigid_pose(matrix, record.where, f"the rotation of {key}")

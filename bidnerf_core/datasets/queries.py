@@ -131,8 +131,10 @@ class DatasetFrames:
             self._rigs = [windowed(listed, listed.index(rig[0]), window) for rig in self._rigs]
             for rig in self._rigs:
                 if window > len(rig):
-                    before = f"{rig[-1]} has only {len(rig) - 1} before it in split {split!r}"
-                    log.info("--window %d: %s; a rig of %d", window, before, len(rig))
+                    log.info(
+                        f"--window {window}: {rig[-1]} has only {len(rig) - 1} before it in split {split!r}; a rig of"
+                        f" {len(rig)}"
+                    )
 
     def select(self, indices: Sequence[int]) -> DatasetFrames:
         """Return only some of the rigs."""
@@ -172,8 +174,10 @@ def photo_files(paths: Sequence[Path], depth: Sequence[Path] = ()) -> list[Path]
             raise no_dataset(path)
         if others:
             named = ", ".join(file.name for file in others[:5])
-            more = f" and {len(others) - 5} more" if len(others) > 5 else ""
-            log.info("%s: skipped %s%s: not photos by their names", path, named, more)
+            log.info(
+                f"{path}: skipped {named}{f' and {len(others) - 5} more' if len(others) > 5 else ''}: not photos by their"
+                " names"
+            )
         files += found
     return files
 

@@ -311,7 +311,10 @@ def no_dataset(path: Path, readers: Sequence[Reader] | None = None, or_else: str
             f"no dataset found: {amount(len(photos), 'photo')} without poses; 'bidnerf poses' finds them, or give"
             " those of an AR framework or a robot;"
         )
-    expected = f"photos or a dataset in one of the formats of docs/datasets.md: {', '.join(READERS)}"
-    if readers is not None:
-        expected = "; or ".join(reader.expected for reader in readers)
-    return InputError(found, where=path, expected=expected)
+    return InputError(
+        found,
+        where=path,
+        expected=f"photos or a dataset in one of the formats of docs/datasets.md: {', '.join(READERS)}"
+        if readers is None
+        else "; or ".join(reader.expected for reader in readers),
+    )

@@ -45,8 +45,9 @@ class DepthImage:
         if self.median is None:
             parts.append("the depth image holds no measurement, so only colour is used")
         elif unit_assumed:
-            middle = f"median depth {self.median:.4g} m"
-            parts.append(f"depth_unit is not given, {self.unit:g} m per step is assumed: {middle}")
+            parts.append(
+                f"depth_unit is not given, {self.unit:g} m per step is assumed: median depth {self.median:.4g} m"
+            )
         return "; ".join([*parts, *filter(None, [self.dropped])]) or None
 
     @property
@@ -148,6 +149,9 @@ class DepthReader:
         new = {name: count for name, count in image.replaced.items() if name not in self._mentioned}
         if new:
             self._mentioned |= new.keys()
-            dropped = replace(image, replaced=new).dropped
-            warnings.warn(f"{path}: depth: {dropped}, here and in the images that follow", InputWarning, stacklevel=2)
+            warnings.warn(
+                f"{path}: depth: {replace(image, replaced=new).dropped}, here and in the images that follow",
+                InputWarning,
+                stacklevel=2,
+            )
         return image

@@ -196,14 +196,14 @@ class Frame:
         path, behind = Path(path), BLACK if background is None else background_colour(background)
         header, exif = read_header(path), read_exif(path)
         raster = Raster(header.width, header.height, exif.orientation)
-        resolved = camera.find(path, raster, exif)
+        resolved = camera.find(path, raster, exif).at_most(largest)
         measured = None if depth is None else read_depth_image(Path(depth), depth_unit)
-        resolved = resolved.at_most(largest)
         size = (resolved.camera.width, resolved.camera.height)
-        if size == raster.upright_size:
-            rgb, alpha = read_compact_image(path, behind)
-        else:
-            rgb, alpha = read_image(path, behind, exif.orientation.upright_size(*size))
+        rgb, alpha = (
+            read_compact_image(path, behind)
+            if size == raster.upright_size
+            else read_image(path, behind, exif.orientation.upright_size(*size))
+        )
         metres = None
         if measured is not None and depth is not None:
             if notice := measured.notice(depth_unit is None):

@@ -60,9 +60,11 @@ def observe(
     frame = view.frame
     columns, rows = pixels.unbind(-1)
     ray, length = frame.intrinsics.rays(pixels.double() + 0.5)
-    depth = torch.zeros_like(length)
-    if frame.depth is not None:
-        depth = frame.depth[rows.to(frame.depth.device), columns.to(frame.depth.device)].to(length)
+    depth = (
+        torch.zeros_like(length)
+        if frame.depth is None
+        else frame.depth[rows.to(frame.depth.device), columns.to(frame.depth.device)].to(length)
+    )
     T = view.T_ref_camera.to(length)
     if view.motion is not None and bool(view.motion.any()):
         T = T @ poses_of_rows(exposure_times(pixels.to(ray) + 0.5, frame.intrinsics), view.motion)

@@ -302,13 +302,13 @@ def _train_further(scene: Map, views: Sequence[View], steps: int | None, share: 
 
 def _in_field_unit(view: View, factor: float) -> View:
     """Return a view with all lengths multiplied by a factor."""
-    pose = SE3(view.T_ref_camera.rotation, view.T_ref_camera.translation * factor)
-    frame, seen = view.frame, view.landmarks
-    if frame.depth is not None:
-        frame = frame.replace(depth=frame.depth * factor)
-    if seen is not None:
-        seen = replace(seen, distance=seen.distance * factor, deviation=seen.deviation * factor)
-    return replace(view, frame=frame, T_ref_camera=pose, landmarks=seen)
+    frame, T, seen = view.frame, view.T_ref_camera, view.landmarks
+    return replace(
+        view,
+        frame=frame if frame.depth is None else frame.replace(depth=frame.depth * factor),
+        T_ref_camera=SE3(T.rotation, T.translation * factor),
+        landmarks=seen and replace(seen, distance=seen.distance * factor, deviation=seen.deviation * factor),
+    )
 
 
 def _present(landmarks: LandmarkMap, more: LandmarkMap) -> Bool[Tensor, "n"]:

@@ -272,12 +272,10 @@ def _report_extent(found: ImportedField, where: str, unit: LengthUnit) -> None:
     log.info(f"{where}: extent {extent}{' metres' if unit == 'metres' else unknown}")
     # The longest side of a plausible scene is between 5 cm and 500 m; other lengths are probably in another unit.
     if not 0.05 <= max(size) <= 500:
-        doubt = (
-            "very large in metres; are its lengths millimetres?"
-            if max(size) > 500
-            else "tiny in metres; are its lengths kilometres or an arbitrary unit?"
-        )
-        warnings.warn(f"{where}: {extent} would be {doubt} --scale changes them", InputWarning, stacklevel=3)
+        large = "very large in metres; are its lengths millimetres?"
+        tiny = "tiny in metres; are its lengths kilometres or an arbitrary unit?"
+        doubt = f"{extent} would be {large if max(size) > 500 else tiny}"
+        warnings.warn(f"{where}: {doubt} --scale changes them", InputWarning, stacklevel=3)
 
 
 @torch.no_grad()

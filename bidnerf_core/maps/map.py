@@ -92,12 +92,10 @@ class Map:
     def __repr__(self) -> str:
         """A one-line description without tensors or cameras; ``describe`` gives the details."""
         info = self.info
-        trained = "no field"
-        if self.has_field:
-            trained = f"{info.backend}, {amount(info.step, 'step')}{'' if info.complete else ' (not complete)'}"
+        trained = f"{info.backend}, {amount(info.step, 'step')}{'' if info.complete else ' (not complete)'}"
         surfels = amount(0 if self.surface is None else len(self.surface.surfels), "surfel")
         landmarks = amount(0 if self.landmarks is None else len(self.landmarks), "landmark")
-        return f"<Map {self.name}: {trained}, {surfels}, {landmarks}>"
+        return f"<Map {self.name}: {trained if self.has_field else 'no field'}, {surfels}, {landmarks}>"
 
     @property
     def has_field(self) -> bool:
@@ -356,9 +354,9 @@ class Map:
         cameras = cameras_of(self.info) or [(view.frame.intrinsics, view.T_ref_camera) for view in views]
         if not cameras:
             raise self._no_cameras()
-        measured = [view for view in views if view.frame.has_depth]
-        if not any(view.frame.has_dense_depth for view in measured):
-            measured = []  # a few points do not make a surface
+        # A few points do not make a surface.
+        is_dense = any(view.frame.has_dense_depth for view in views)
+        measured = [view for view in views if is_dense and view.frame.has_depth]
         surface = bake(self.field, self.bounds, [] if measured else cameras, measured, config)
         log.info(
             f"{self.name}: surface of {len(surface.surfels)} surfels from"
@@ -429,9 +427,11 @@ class Map:
                 where=folder,
                 expected="an nn.Module of a backend",
             )
-        state = TrainingState(self.info.step, field.state_dict(), {})
-        if self.info.training is not None and self.folder is not None:
-            state = load_state(self.folder, self.info, self.field)
+        state = (
+            TrainingState(self.info.step, field.state_dict(), {})
+            if self.info.training is None or self.folder is None
+            else load_state(self.folder, self.info, self.field)
+        )
         whole = self.whole()
         here = whole.to("cpu")
         info = write_parts(folder, whole.info, state, here.surface, here.landmarks, self.capture)
@@ -441,14 +441,13 @@ class Map:
         """Return the map with all parts of its folder, including those not loaded and an anchor added later."""
         if self.folder is None:
             return self
-        surface, landmarks, info = self.surface, self.landmarks, self.info
-        if surface is None:
-            surface = read_part(self.folder, info, "surface")
-        if landmarks is None:
-            landmarks = read_part(self.folder, info, "landmarks")
-        if info.anchor is None:
-            info = replace(info, anchor=load_info(self.folder).anchor)
-        return replace(self, info=info, surface=surface, landmarks=landmarks)
+        folder, info = self.folder, self.info
+        return replace(
+            self,
+            info=replace(info, anchor=load_info(folder).anchor if info.anchor is None else info.anchor),
+            surface=read_part(folder, info, "surface") if self.surface is None else self.surface,
+            landmarks=read_part(folder, info, "landmarks") if self.landmarks is None else self.landmarks,
+        )
 
 
 def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool = True) -> Map:

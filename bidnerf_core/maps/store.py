@@ -222,12 +222,11 @@ class Checkpoints:
     def step(self, progress: TrainingStep) -> None:
         self._state = None  # free it: it is as large as the field and its optimizer
         self._step, self._total = progress.step, progress.total
-        if self._job.progress is None:
-            return
-        figures = f"loss {progress.loss:.5f}  PSNR {progress.psnr:.2f} dB"
-        if not math.isnan(progress.samples_per_ray):  # not every recipe reports it
-            figures += f"  {progress.samples_per_ray:.1f} samples per ray"
-        self._job.progress(Progress("training", progress.step, progress.total, "steps", figures))
+        if self._job.progress is not None:
+            figures = f"loss {progress.loss:.5f}  PSNR {progress.psnr:.2f} dB"
+            if not math.isnan(progress.samples_per_ray):  # not every recipe reports it
+                figures += f"  {progress.samples_per_ray:.1f} samples per ray"
+            self._job.progress(Progress("training", progress.step, progress.total, "steps", figures))
 
     def due(self, step: int) -> bool:
         return step == self._total or (self.folder is not None and time.monotonic() - self._saved > self._seconds)

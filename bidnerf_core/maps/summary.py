@@ -159,9 +159,7 @@ def rendering_scores(image: RenderedImage, frame: Frame, unit: LengthUnit = "uni
 
     ``unit`` is the length unit of the map, used to print the depth error.
     """
-    errors = torch.zeros(0)
-    if frame.depth is not None and frame.has_depth:
-        errors = (image.depth - frame.depth).abs()[frame.depth > 0]
+    errors = torch.zeros(0) if frame.depth is None else (image.depth - frame.depth).abs()[frame.depth > 0]
     shown, seen = image.rgb, frame.rgb
     if frame.hidden is not None:
         shown, seen = shown[~frame.hidden], seen[~frame.hidden]

@@ -166,8 +166,8 @@ def train(
         if any(origin):
             log.info(f"{read.where}: the map's own coordinates begin at {origin}, near its cameras")
         read = read.about(origin)
-        part = f" in split {images.split!r}" if read.source else ""
         if not any(view.frame.has_depth for view in read.views):
+            part = f" in split {images.split!r}" if read.source else ""
             log.info(f"{read.where}: no measured depth{part}; training on colour only")
         taken = prepare_views(
             read.views,
@@ -313,8 +313,11 @@ def check_resumable(folder: Path, baking: bool = True) -> MapInfo:
     except InputError as error:
         raise InputError(f"{error}; nothing to resume, train without --resume") from error
     if info.complete and not (baking and (info.surface is None or info.capture is None)):
-        baked = " and baked" if info.surface is not None else ""
-        raise InputError(f"training is complete ({amount(info.step, 'step')}){baked}, nothing to resume", where=folder)
+        raise InputError(
+            f"training is complete ({amount(info.step, 'step')}){'' if info.surface is None else ' and baked'}, nothing"
+            " to resume",
+            where=folder,
+        )
     return info
 
 
@@ -361,9 +364,9 @@ def poses_folder(out: Path) -> Path:
 def _check_same_views(out: Path, info: MapInfo, read: ReadViews, split: str) -> None:
     """Raise ``InputError`` if the views, their masks, sparse depth or background are not those with which training began."""
     if stored_cameras(read.views) != given_cameras(info.cameras):
-        part = f"split {split!r} has" if read.source else "these have"
         raise InputError(
-            f"{part} frames or poses that differ from those {out} was started with",
+            f"{f'split {split!r} has' if read.source else 'these have'} frames or poses that differ from those {out} was"
+            " started with",
             where=read.where,
             expected=f"those of {info.data!r} unchanged",
         )

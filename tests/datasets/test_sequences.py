@@ -97,7 +97,7 @@ def test_sequences_are_indexed_and_reversed_without_reading(tmp_path: Path) -> N
     sequence = open_sequence(write_file(tmp_path, [{"time": n} for n in range(4)]))
     (tmp_path / "images/b_2.png").unlink()
     assert sequence.names == list(NAMES)
-    assert sequence.times == [0, 1, 2, 3]
+    assert [shot.time for shot in sequence.shots] == [0, 1, 2, 3]
     assert names(sequence[::2]) == ["b_10", "a_3"]
     assert names(sequence[::-1][:2]) == ["b_1", "a_3"]
     assert sequence[-1].frame.name == "b_1"
@@ -147,7 +147,7 @@ def test_places_without_a_sequence(tmp_path: Path) -> None:
 def test_a_recorded_sequence_is_one_video(data_dir: Path) -> None:
     """Train and test together are every fourth frame of a video at 30 Hz, in which the camera does not jump."""
     sequence = open_sequence(data_dir / "tum_fr1_xyz")
-    times = torch.tensor([time for time in sequence.times if time is not None], dtype=torch.float64)
+    times = torch.tensor([shot.time for shot in sequence.shots if shot.time is not None], dtype=torch.float64)
     assert len(times) == len(sequence) == 199
     assert 0.1 < float(times.diff().min()) < float(times.diff().max()) < 0.3  # one frame is missing
     truths = [timed.truth for timed in sequence[:40]]

@@ -70,14 +70,16 @@ def _read(path: Path, models: list[Path], options: DatasetOptions) -> Capture:
     """Read the project. Raises ``InputError`` if its model is damaged or has no registered image."""
     model, folder, images, cameras, files = colmap_project(path)
     if options.masks is None and any((each / "masks").is_dir() for each in (path, folder.parent)):
-        text = "masks lies beside the images and is not used; name it (--masks, masks= in Python) to use it"
-        warn_about(path, text)
+        warn_about(path, "masks lies beside the images and is not used; name it (--masks, masks= in Python) to use it")
     if folder != path:
         photos = [file for file in folder.rglob("[!.]*") if file.suffix.lower() in IMAGE_ENDINGS[1:]]
         others = sorted(set(photos) - set(files.values()), key=lambda file: natural_order(str(file)))
         if others:
-            text = f"{len(others)} of {amount(len(photos), 'photo')} are not registered in the model and are left out"
-            warn_about(folder, f"{text}, first: {others[0].relative_to(folder)}")
+            warn_about(
+                folder,
+                f"{len(others)} of {amount(len(photos), 'photo')} are not registered in the model and are left out, first:"
+                f" {others[0].relative_to(folder)}",
+            )
     shots = [shot_of(model, i, files.get(i.name, folder / posix_name(i.name)), cameras) for i in images]
     return Capture(path, shots, options.colour, pose_file=model)
 
@@ -93,8 +95,10 @@ def colmap_project(path: Path) -> tuple[Path, Path, list[ModelImage], dict[int, 
     others = _models_at(folder.parent / "sparse") if files else []
     if others and model.resolve() not in [each.resolve() for each in others]:
         # For example, the images of dense/0 are undistorted, while those of sparse/0 lie elsewhere.
-        text = f"{folder.relative_to(path)} has a model of its own, which is used instead of {model.relative_to(path)}"
-        warn_about(path, text)
+        warn_about(
+            path,
+            f"{folder.relative_to(path)} has a model of its own, which is used instead of {model.relative_to(path)}",
+        )
         model, images, cameras = _largest(path, others)
         folder, files = _image_folder(path, model, images)
     if not images:
@@ -130,8 +134,11 @@ def _largest(path: Path, models: Sequence[Path]) -> tuple[Path, list[ModelImage]
         count = {model: amount(len(images), "image") for model, (images, _) in read.items()}
         sizes = {model: f"{model.relative_to(path)} with {count[model]}" for model in models}
         used = sizes.pop(chosen)
-        text = f"has {len(models)} models, of which {used} is used, not {', '.join(sizes.values())}"
-        warn_about(path, f"{text}; each model has its own world frame")
+        warn_about(
+            path,
+            f"has {len(models)} models, of which {used} is used, not {', '.join(sizes.values())}; each model has its own"
+            " world frame",
+        )
     return chosen, *read[chosen]
 
 

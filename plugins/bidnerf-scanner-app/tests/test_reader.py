@@ -340,7 +340,7 @@ def test_the_sequence_has_the_depth_between_photos(scan: Path) -> None:
 def test_a_recorded_scan_in_the_order_of_time() -> None:
     sequence = open_sequence(Path(str(DATA)) / "iphone_corridor")
     assert len(sequence) == 436
-    times = np.array(sequence.times, dtype=float)
+    times = np.array([shot.time for shot in sequence.shots], dtype=float)
     assert (np.diff(times) > 0).all()
     kinds = [timed.frame.has_colour for timed in sequence[:30]]
     assert kinds == [number % 3 == 0 for number in range(30)]
