@@ -19,7 +19,7 @@ from torch import Tensor
 
 from bidnerf_core.datasets.colmap_files import ModelImage, read_model
 from bidnerf_core.depth import nearest_depth
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, errors_in
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, fit_similarity, spread
 from bidnerf_core.settings import Above, Settings, WholeNumbers
@@ -75,7 +75,7 @@ class SparsePoints:
             )
         there, here = (torch.stack([pair[i].double().cpu() for pair in known]) for i in (0, 1))
         fits = torch.ones(len(known), dtype=torch.bool)
-        try:
+        with errors_in(f"{folder}: the unit cannot be estimated from the training cameras"):
             for _ in range(2):
                 # The second fit leaves out cameras whose error exceeds three times the median, unless it is tiny.
                 used, fit = fits, fit_similarity(there[fits], here[fits])
@@ -83,10 +83,6 @@ class SparsePoints:
                 fits = errors <= max(3 * float(errors.median()), 0.01 * spread(here))
             self.metres, self.cameras = fit.scale, int(used.sum())
             self.misfit = float(errors[used].median()) / spread(here[used])
-        except InputError as error:
-            raise InputError(
-                error, where=f"{folder}: the unit cannot be estimated from the training cameras"
-            ) from error
         # A larger misfit indicates a different scene; a hand-held camera that moved by decimetres reaches 0.03.
         if self.misfit > 0.2:
             raise InputError(

@@ -50,8 +50,9 @@ def _array(file: BinaryIO | io.BytesIO, size: int) -> np.ndarray:
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0)):
         raise ValueError(f"version {version} of the format")
-    old, new = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
-    shape, _, kind = (old if version == (1, 0) else new)(file)
+    shape, _, kind = (
+        np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    )(file)
     if kind.hasobject:
         raise ValueError("objects of Python")
     needed, left = math.prod(shape) * kind.itemsize, size - file.tell()
