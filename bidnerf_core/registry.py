@@ -93,8 +93,8 @@ class PluginInfo:
     def description(self) -> str:
         """The summary, with the distribution if it is not bidnerf's own, and the fault if there is one."""
         source = "" if self.is_bundled else f"[{self.distribution} {self.version}".strip() + "]"
-        fault = "" if self.fault is None else f"fault: {self.fault}"
-        return " ".join(filter(None, (self.summary.replace("``", "'"), source, fault)))
+        clauses = self.summary.replace("``", "'"), source, self.fault and f"fault: {self.fault}"
+        return " ".join(filter(None, clauses))
 
     def __str__(self) -> str:
         origin = f"from {self.distribution} {self.version}" if self.version else "registered in this process"

@@ -203,8 +203,7 @@ def match_pair(images: Sequence[ImageKeypoints], i: int, j: int) -> MatchedPair 
 @cache
 def readings(count: int) -> tuple[Reading, ...]:
     """Return the readings to try for ``count`` poses, most common first: of readings that fit equally well, the first is preferred."""
-    kinds = _of_axes(), _of_parts(), _of_quaternions(), _of_worlds(), _of_positions(), _of_orders(count)
-    return tuple(itertools.chain(*kinds))
+    return (*_of_axes(), *_of_parts(), *_of_quaternions(), *_of_worlds(), *_of_positions(), *_of_orders(count))
 
 
 def reinterpret(

@@ -6,7 +6,7 @@ Frame timestamps are read from the file, in seconds from the start, because phon
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -131,11 +131,9 @@ def is_video(path: Path) -> bool:
     """Return whether a file is a video, judging by its name or first bytes, without decoding it."""
     if path.suffix.lower() in VIDEO_SUFFIXES:
         return not path.is_dir()
-    try:
-        with open_binary(path, "a video file") as file:
-            head = file.read(12)
-    except InputError:
-        return False
+    head = b""
+    with suppress(InputError), open_binary(path, "a video file") as file:
+        head = file.read(12)
     mp4 = head[4:8] == b"ftyp" and not looks_like_image(path)
     # The second is the beginning of Matroska and WebM.
     return mp4 or head[:4] == b"\x1aE\xdf\xa3" or (head[:4] == b"RIFF" and head[8:12] == b"AVI ")

@@ -322,9 +322,15 @@ class Frame:
             if notice := measured.notice(depth_unit is None):
                 warnings.warn(f"{where}: {notice}", InputWarning, stacklevel=2)
         laid = composite(colour, cover, BLACK if background is None else background_colour(background))
-        unused = None if hidden is None else torch.as_tensor(hidden)
-        awaits = background is None and cover is not None
-        return Frame(name, laid, intrinsics, metres, cover, hidden=unused, awaits_background=awaits)
+        return Frame(
+            name,
+            laid,
+            intrinsics,
+            metres,
+            cover,
+            hidden=None if hidden is None else torch.as_tensor(hidden),
+            awaits_background=background is None and cover is not None,
+        )
 
     def replace(self, **changes: Any) -> Frame:
         """Return the frame with ``changes`` to its attributes, as ``dataclasses.replace`` does, without converting its colours."""

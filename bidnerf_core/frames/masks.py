@@ -132,8 +132,9 @@ def masks_sentence(hidden: Sequence[Bool[Tensor, "h w"] | None]) -> str | None:
     if not shares:
         return None
     mean, without = 100 * sum(shares) / len(shares), len(hidden) - len(shares)
-    line = f"masks hide {mean:.3g} % of the pixels of {amount(len(shares), 'image')}"
-    line += f"; {amount(without, 'image')} without hidden pixels" if without else ""
-    if float(np.median(shares)) > 0.5:
-        line += f"; {INVERTED}"
-    return line
+    clauses = (
+        f"masks hide {mean:.3g} % of the pixels of {amount(len(shares), 'image')}",
+        f"{amount(without, 'image')} without hidden pixels" if without else None,
+        INVERTED if float(np.median(shares)) > 0.5 else None,
+    )
+    return "; ".join(filter(None, clauses))

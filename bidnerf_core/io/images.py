@@ -344,11 +344,9 @@ def is_heif(head: bytes) -> bool:
 
 def looks_like_image(path: Path) -> bool:
     """Return whether the first bytes of a file identify it as an image; nothing is decoded."""
-    try:
-        with open_binary(path, "an image file") as file:
-            head = file.read(12)
-    except InputError:
-        return False
+    head = b""
+    with contextlib.suppress(InputError), open_binary(path, "an image file") as file:
+        head = file.read(12)
     first = rb"(?s)\x89PNG\r\n|\xff\xd8\xff|II\*\0|MM\0\*|GIF8|RIFF....WEBP|BM....\0\0\0\0|....ftypavi[fs]"
     return re.match(first, head) is not None or is_heif(head)
 

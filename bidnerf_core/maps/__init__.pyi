@@ -8,7 +8,6 @@ from .description import MapInfo as MapInfo
 from .description import cameras_of as cameras_of
 from .description import load_info as load_info
 from .description import longest_side as longest_side
-from .description import named_poses as named_poses
 from .extending import extend as extend
 from .importers import IMPORTERS as IMPORTERS
 from .importers import UNMOVED as UNMOVED

@@ -146,11 +146,6 @@ def cameras_of(info: MapInfo) -> list[tuple[Intrinsics, SE3]]:
     return [(c.intrinsics, c.pose) for c in info.cameras]
 
 
-def named_poses(info: MapInfo) -> list[tuple[str, SE3]]:
-    """Return the name and T_world_camera (float64, relative to the map's origin) of each training image."""
-    return [(camera.name, camera.pose) for camera in info.cameras]
-
-
 def longest_side(info: MapInfo) -> int | None:
     """Return the longer side (pixels) of the largest training image after downscaling; None without cameras."""
     return max((max(c.intrinsics.width, c.intrinsics.height) for c in info.cameras), default=None)

@@ -158,9 +158,12 @@ def import_map(
             scene.check_alike(views, where)
             ratio = ratio_to_measured_depth(scene.field, scene.bounds, views)
             if ratio is not None and abs(ratio - 1) > 0.03:  # less is not worth reporting
-                text = f"the photos' measured depth is {ratio:.3g} times the field's; is its scale different?"
-                text = f"{where}: {text} The poses of the photos would have to be scaled as well"
-                warnings.warn(text, InputWarning, stacklevel=2)
+                warnings.warn(
+                    f"{where}: the photos' measured depth is {ratio:.3g} times the field's; is its scale different? The"
+                    " poses of the photos would have to be scaled as well",
+                    InputWarning,
+                    stacklevel=2,
+                )
         if folder is not None:
             scene = replace(
                 scene, info=write_parts(folder, scene.info, TrainingState(step, found.tensors, {})), folder=folder

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from jaxtyping import Float
@@ -82,8 +82,7 @@ class MapSummary:
     def plain(self) -> dict[str, Any]:
         """Return the facts as JSON-serializable values."""
         described = {name: getattr(self.info, name) for name in DESCRIBED}
-        facts: dict[str, Any] = to_plain(described | self.facts)
-        return facts
+        return cast(dict[str, Any], to_plain(described | self.facts))
 
     def __str__(self) -> str:
         info, facts, bounds = self.info, self.facts, self.info.bounds
@@ -150,8 +149,10 @@ class RenderingScores:
         return float(self.depth_errors.median()) if len(self.depth_errors) else None
 
     def __str__(self) -> str:
-        error = "-" if self.depth_error is None else f"{self.depth_error:.4f}"
-        return f"PSNR {self.psnr:.2f} dB  depth error {error} {symbol(self.unit)}"
+        return (
+            f"PSNR {self.psnr:.2f} dB  depth error"
+            f" {'-' if self.depth_error is None else f'{self.depth_error:.4f}'} {symbol(self.unit)}"
+        )
 
 
 def rendering_scores(image: RenderedImage, frame: Frame, unit: LengthUnit = "units") -> RenderingScores:

@@ -249,8 +249,8 @@ def report_finished_parts(folder: Path | None) -> Iterator[None]:
             info = None if folder is None else load_info(folder)
         if info is None or isinstance(stopped.__cause__, TrainingStopped):
             raise
-        there = {"landmarks": info.landmarks, "field": info.step, "surface": info.surface}
-        parts = enumeration([part for part, found in there.items() if found]) or "nothing"
+        stages = zip(("landmarks", "field", "surface"), (info.landmarks, info.step, info.surface), strict=True)
+        parts = enumeration([stage for stage, done in stages if done]) or "nothing"
         raise Cancelled(
             f"{folder}: {stopped}; the map has its {parts} so far; --resume continues, --finish ends it as it is"
         ) from stopped
