@@ -140,7 +140,7 @@ def test_what_is_kept_otherwise_is_read(kind: str, tmp_path: Path) -> None:
     assert all(view.frame.intrinsics.distortion == () for view in views.values())
     sizes = {(view.frame.intrinsics.width, view.frame.intrinsics.height) for view in views.values()}
     assert sizes == {(8, 6) if "reduced" in kind else (SMALL.width, SMALL.height)}
-    times = [time for time in open_sequence(folder).times if time is not None]
+    times = [shot.time for shot in open_sequence(folder).shots if shot.time is not None]
     assert not times or max(times) - min(times) < 2 * COUNT
 
 
