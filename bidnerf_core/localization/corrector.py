@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
-from contextlib import suppress
-from queue import Empty, Full, Queue
-from threading import Lock, Thread
+from concurrent.futures import Future, ThreadPoolExecutor
+from threading import Lock
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame
@@ -28,13 +26,10 @@ class Corrector:
         """Start the thread, which localizes frames with ``localizer``."""
         self.T_world_odom: SE3 | None = None  # the correction from the last accepted answer
         self.found: Localization | None = None  # the last answer, accepted or not
-        self._localizer, self._errors = localizer, deque[BaseException](maxlen=1)
-        self._waiting: Queue[tuple[Frame, SE3] | None] = Queue(1)  # None ends the thread
-        self._closed, self._lock = False, Lock()
-        self._thread = Thread(target=self._run, name="bidnerf-corrector", daemon=True)
-        self._thread.start()
+        self._localizer, self._lock = localizer, Lock()
+        self._pool, self._pending = ThreadPoolExecutor(1, "bidnerf-corrector"), list[Future[None]]()
 
-    def corrected(self, T_odom_camera: SE3) -> SE3 | None:
+    def correct(self, T_odom_camera: SE3) -> SE3 | None:
         """Return T_world_camera for a pose in the odometry's frame; None until an answer has been accepted."""
         T_world_odom = self.T_world_odom
         return None if T_world_odom is None else T_world_odom @ T_odom_camera
@@ -46,10 +41,11 @@ class Corrector:
         """
         self._raise_error()
         with self._lock:
-            if self._closed:
-                raise InputError("the corrector is closed and takes no more frames")
-            with suppress(Full):
-                self._waiting.put_nowait((frame, T_odom_camera))
+            if len(self._pending) < 2:  # besides the frame that is being localized, one may wait
+                try:
+                    self._pending.append(self._pool.submit(self._localize, frame, T_odom_camera))
+                except RuntimeError as error:
+                    raise InputError("the corrector is closed and takes no more frames") from error
                 return True
         return False
 
@@ -58,12 +54,7 @@ class Corrector:
 
         Raises any localization error that has not been raised yet.
         """
-        with self._lock:
-            self._closed = True
-            with suppress(Empty):
-                self._waiting.get_nowait()
-            self._waiting.put_nowait(None)
-        self._thread.join()
+        self._pool.shutdown(cancel_futures=True)
         self._raise_error()
 
     def __enter__(self) -> Corrector:
@@ -74,16 +65,13 @@ class Corrector:
 
     def _raise_error(self) -> None:
         with self._lock:
-            error = self._errors.pop() if self._errors else None
-        if error is not None:
-            raise error
+            done = [future for future in self._pending if future.done()]
+            self._pending = [future for future in self._pending if future not in done]
+        for future in done:
+            if not future.cancelled():
+                future.result()
 
-    def _run(self) -> None:
-        while (given := self._waiting.get()) is not None:
-            frame, T_odom_camera = given
-            try:
-                self.found = found = self._localizer(frame, start=self.corrected(T_odom_camera))
-                if found.converged:
-                    self.T_world_odom = found.T_world_camera @ T_odom_camera.inverse()
-            except BaseException as error:  # raised in the caller's thread
-                self._errors.append(error)
+    def _localize(self, frame: Frame, T_odom_camera: SE3) -> None:
+        self.found = found = self._localizer(frame, start=self.correct(T_odom_camera))
+        if found.converged:
+            self.T_world_odom = found.T_world_camera @ T_odom_camera.inverse()

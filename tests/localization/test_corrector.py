@@ -67,22 +67,22 @@ def until(condition: Callable[[], object]) -> None:
 def test_an_accepted_answer_corrects_the_odometry_of_its_frame(corrector: Callable[..., Any]) -> None:
     localizer, mine = corrector(FOUND, replace(FOUND, outcome=Outcome.AMBIGUOUS, T_world_camera=pose(*[9.0] * 6)))
     assert mine.T_world_odom is None
-    assert mine.corrected(T_ODOM_CAMERA) is None
+    assert mine.correct(T_ODOM_CAMERA) is None
     assert mine.give(FRAME, T_ODOM_CAMERA)
     localizer.go_on.release()
     until(lambda: mine.T_world_odom is not None)
-    torch.testing.assert_close(mine.corrected(T_ODOM_CAMERA).matrix(), T_WORLD_CAMERA.matrix())
+    torch.testing.assert_close(mine.correct(T_ODOM_CAMERA).matrix(), T_WORLD_CAMERA.matrix())
     moved = T_ODOM_CAMERA @ pose(0.1, 0.0, 0.0, 0.0, 0.0, 0.0)
     torch.testing.assert_close(
-        mine.corrected(moved).matrix(), (T_WORLD_CAMERA @ pose(0.1, 0.0, 0.0, 0.0, 0.0, 0.0)).matrix()
+        mine.correct(moved).matrix(), (T_WORLD_CAMERA @ pose(0.1, 0.0, 0.0, 0.0, 0.0, 0.0)).matrix()
     )
     assert mine.give(FRAME, moved)  # a rejected answer, which changes nothing
     localizer.go_on.release()
     until(lambda: mine.found is not FOUND)
     mine.close()
-    torch.testing.assert_close(mine.corrected(T_ODOM_CAMERA).matrix(), T_WORLD_CAMERA.matrix())
+    torch.testing.assert_close(mine.correct(T_ODOM_CAMERA).matrix(), T_WORLD_CAMERA.matrix())
     assert localizer.starts[0] is None
-    torch.testing.assert_close(localizer.starts[1].matrix(), mine.corrected(moved).matrix())
+    torch.testing.assert_close(localizer.starts[1].matrix(), mine.correct(moved).matrix())
 
 
 def test_a_frame_is_dropped_while_another_waits(corrector: Callable[..., Any]) -> None:
@@ -142,4 +142,4 @@ def test_many_threads_may_give(corrector: Callable[..., Any]) -> None:
         for thread in threads:
             thread.join(SECONDS)
     assert len(taken) == 400
-    assert sum(taken) - 1 <= len(localizer.starts) <= sum(taken)  # closing may drop the last one
+    assert sum(taken) - 2 <= len(localizer.starts) <= sum(taken)  # closing may drop those that have not begun
