@@ -218,7 +218,7 @@ def depth_difference(image: RenderedImage, frame: Frame) -> Json | None:
 def _steps(localization: Localization, record: SearchRecord | None) -> tuple[Json, ...]:
     """Return the steps of the search (or else of the descent), then the pose together with its rivals, then the pose found."""
     last = localization.T_world_camera.to("cpu", torch.float64)
-    shown = [] if record is None else [_step(s.caption, s.T, s.scores.tolist(), s.kept) for s in record.steps]
+    shown = [] if record is None else [_step(s.caption, s.T, s.scores.tolist(), s.passing) for s in record.steps]
     if not shown:  # no search: the steps of the descent, evenly spread
         count = min(len(localization.losses), len(localization.poses.translation) - 1)
         for number in range(0, count, max(1, math.ceil(count / MOST_STEPS))):

@@ -24,7 +24,7 @@ from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import to_plain, write_file
-from bidnerf_core.localization import Localization, Localizer, SearchRecord, recorded
+from bidnerf_core.localization import Localization, Localizer, SearchRecord, record_search
 from bidnerf_core.maps import Map
 
 MODULES = ("data", "space", "compare", "panel", "table", "track", "live", "main")
@@ -152,7 +152,7 @@ def answer_query(
     and an answer whose pictures show the surface.
     """
     scene, frame = localizer.scene, query.frame
-    with recorded() as record:
+    with record_search() as record:
         if follow is not None:
             follow(record, None)
         localization = localizer(query.views, start, seed=seed)

@@ -54,7 +54,7 @@ from .result import Localization as Localization
 from .result import Outcome as Outcome
 from .result import SearchRecord as SearchRecord
 from .result import Verdict as Verdict
-from .result import recorded as recorded
+from .result import record_search as record_search
 from .search import RayTerms as RayTerms
 from .search import states_at as states_at
 from .settings import AdamSettings as AdamSettings

@@ -113,7 +113,7 @@ class Localizer:
         origin = origin_of(self.scene)
         near = None if start is None else start_pose(start).translated(-origin)
         problem = self.problem(query, near, depth_rays)
-        found, frame = self.solved(problem, seed).translated(origin), problem.views[-1].frame
+        found, frame = self.solve(problem, seed).translated(origin), problem.views[-1].frame
         # Every n-th pixel, at most 240 along the longer side, since each rendered pixel takes time.
         step = -(-max(frame.intrinsics.width, frame.intrinsics.height) // 240)
         photo = frame.rgb_bytes[step // 2 :: step, step // 2 :: step].contiguous()
@@ -192,7 +192,7 @@ class Localizer:
     ) -> Problem:
         """Return the problem that ``__call__`` solves; solving it several times detects the images' keypoints only once.
 
-        Unlike in ``__call__``, ``start`` is in the map's own coordinates (see ``Map.origin``), and so is the answer of ``solved``.
+        Unlike in ``__call__``, ``start`` is in the map's own coordinates (see ``Map.origin``), and so is the answer of ``solve``.
         """
         T_world_camera = None if start is None else start_pose(start)
         if isinstance(query, str | Path):
@@ -200,7 +200,7 @@ class Localizer:
         views = [view.over(self.scene.bounds.background) for view in _views(query)]
         return rig(self.scene, views, T_world_camera, depth_rays, self.matcher)
 
-    def solved(self, problem: Problem, seed: int = 0) -> Localization:
+    def solve(self, problem: Problem, seed: int = 0) -> Localization:
         """Solve a ``problem`` created by this localizer; the pose is in the map's own coordinates.
 
         Raises ``InputError`` if the seed is unsuitable, or if the method does not return a ``Localization``.

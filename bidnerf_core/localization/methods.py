@@ -36,7 +36,7 @@ from bidnerf_core.localization.search import (
     SHAPE_SIGMA,
     RayTerms,
     Stage,
-    centred,
+    centre_in_view,
     colour_stages,
     halve,
     image_stages,
@@ -111,18 +111,18 @@ def find_method(name: str) -> Method:
 def require_use_of_depth(method: str) -> None:
     """Raise ``InputError`` for a method that would ignore explicitly given depth points."""
     if not find_method(method).uses_depth:
-        others = _names_of(lambda other: other.uses_depth)
+        others = _list_methods(lambda other: other.uses_depth)
         raise InputError(f"method {method!r} uses colour alone, got depth points; use method {others}")
 
 
 def require_start(method: str, given: bool) -> None:
     """Raise ``InputError`` if a method needs a start and none is ``given``."""
     if find_method(method).needs_start and not given:
-        others = _names_of(lambda other: not other.needs_start)
+        others = _list_methods(lambda other: not other.needs_start)
         raise InputError(f"method {method!r} needs a start; give one by --start, or use method {others}")
 
 
-def _names_of(wanted: Callable[[Method], bool]) -> str:
+def _list_methods(wanted: Callable[[Method], bool]) -> str:
     """Return, as text, the names of the methods for which ``wanted`` is true, leaving out methods that cannot be loaded."""
     found = []
     for name in METHODS:
@@ -171,17 +171,17 @@ class InerfConfig(Settings):
 
 def bid(problem: Problem, config: BidConfig, seed: int = 0) -> Localization:
     """Refine ``problem.start`` with Adam on colour and depth; pixels are drawn with ``seed``. Raises ``InputError`` without a start."""
-    return descended(problem, config, config.depth, config.reach, seed, "bid")
+    return descend_from_start(problem, config, config.depth, config.reach, seed, "bid")
 
 
 def inerf(problem: Problem, config: InerfConfig, seed: int = 0) -> Localization:
     """Refine ``problem.start`` with Adam on colour alone. Raises ``InputError`` for more than one image, or without a start."""
     if len(problem.views) > 1:
         raise InputError(f"method inerf takes one image, got {len(problem.views)}; method bid takes several")
-    return descended(problem, config, None, ReachSettings(), seed, "inerf")
+    return descend_from_start(problem, config, None, ReachSettings(), seed, "inerf")
 
 
-def descended(
+def descend_from_start(
     problem: Problem,
     config: BidConfig | InerfConfig,
     depth: DepthSettings | None,
@@ -276,7 +276,7 @@ def bid_lm(problem: Problem, config: BidLmConfig, seed: int = 0) -> Localization
 
     Raises ``InputError`` if there is no start.
     """
-    return _halved(problem, config, config.depth, (0.1, 0.12), seed, "bid-lm")
+    return _search_near_start(problem, config, config.depth, (0.1, 0.12), seed, "bid-lm")
 
 
 def inerf_lm(problem: Problem, config: InerfLmConfig, seed: int = 0) -> Localization:
@@ -284,10 +284,10 @@ def inerf_lm(problem: Problem, config: InerfLmConfig, seed: int = 0) -> Localiza
 
     The method needs only the field; it uses neither measured depth nor a baked surface. Raises ``InputError`` if there is no start.
     """
-    return _halved(problem.without_depth(), config, None, (0.04, 0.25), seed, "inerf-lm")
+    return _search_near_start(problem.without_depth(), config, None, (0.04, 0.25), seed, "inerf-lm")
 
 
-def _halved(
+def _search_near_start(
     problem: Problem,
     config: BidLmConfig | InerfLmConfig,
     depth: DepthLossSettings | None,
@@ -304,7 +304,7 @@ def _halved(
     poses = neighbours(start, config.poses, spread[0] * float(middle.norm()), spread[1], seed)
     terms, rays = RayTerms(steps.colour, depth, config.exposure), steps.fine_rays
     if depth is not None and problem.has_depth:
-        poses = SE3.cat([poses, centred(problem, poses, middle)])
+        poses = SE3.cat([poses, centre_in_view(problem, poses, middle)])
         # Coarse steps with depth average colours over squares of eight pixels.
         coarse = partial(terms.term, problem, level=0, blur=8)
         stages: Iterable[Stage] = (

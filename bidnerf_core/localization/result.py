@@ -265,7 +265,7 @@ class RecordedStep:
     caption: str
     T: SE3  # T_world_camera (h), best first, on the CPU
     scores: Float[Tensor, "h"]  # lower is better; only those of one step can be compared
-    kept: int  # number of poses passed on to the next step
+    passing: int  # number of poses passed on to the next step
 
 
 @dataclass(eq=False)
@@ -275,21 +275,21 @@ class SearchRecord:
     steps: list[RecordedStep] = field(default_factory=list)
     answers: list[LandmarkAnswer] = field(default_factory=list)
 
-    def add(self, caption: str, T: SE3, scores: Float[Tensor, "h"] | None = None, kept: int = 1) -> None:
+    def add(self, caption: str, T: SE3, scores: Float[Tensor, "h"] | None = None, passing: int = 1) -> None:
         """Record poses T (h) or a single pose; without scores, the poses must be sorted, best first."""
         T = T if T.translation.ndim == 2 else T[None]
         if scores is None:
             scores = torch.arange(len(T.translation), dtype=torch.float64)
         best = scores.argsort()[:400]  # only the best poses of a step are kept
         T, scores = move_to((T[best], scores[best]), "cpu")
-        self.steps.append(RecordedStep(caption, T, scores.double(), min(kept, len(best))))
+        self.steps.append(RecordedStep(caption, T, scores.double(), min(passing, len(best))))
 
 
 _RECORD: ContextVar[SearchRecord | None] = ContextVar("record", default=None)
 
 
 @contextmanager
-def recorded() -> Iterator[SearchRecord]:
+def record_search() -> Iterator[SearchRecord]:
     """Yield a record that collects the steps and answers of this thread's localizations within the block."""
     token = _RECORD.set(record := SearchRecord())
     try:

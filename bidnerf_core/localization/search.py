@@ -176,7 +176,7 @@ def colour_stages(problem: Problem, terms: RayTerms, steps: RefinementSettings, 
 
 
 @torch.no_grad()
-def centred(problem: Problem, T: SE3, middle: Float[Tensor, "3"]) -> SE3:
+def centre_in_view(problem: Problem, T: SE3, middle: Float[Tensor, "3"]) -> SE3:
     """Return the poses T (h), each camera shifted so that the median rendered point coincides with the measured ``middle``.
 
     When a scene is seen from outside, the main error is often that the scene appears in the wrong part of the image. The shift

@@ -120,7 +120,7 @@ def localize_new(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut])
     for number, frame in enumerate(frames, start=1):
         check_cancelled("extending")
         try:
-            found = localizer.solved(localizer.problem(frame))
+            found = localizer.solve(localizer.problem(frame))
         except InputError as error:
             left_out.append((frame.name, str(error)))
         else:

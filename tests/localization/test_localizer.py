@@ -101,7 +101,7 @@ def test_an_answer_shows_the_photo_beside_the_map_in_a_notebook() -> None:
     torch.testing.assert_close(photo / 255, small.rgb, rtol=0, atol=0.01)
     torch.testing.assert_close(both, (photo + rendered) / 2, rtol=0, atol=1.1)
     assert html.escape(repr(found)) in text
-    assert localizer().solved(localizer().problem(FRAME, START))._repr_html_().startswith("<div>&lt;Localization")
+    assert localizer().solve(localizer().problem(FRAME, START))._repr_html_().startswith("<div>&lt;Localization")
 
 
 def test_an_answer_is_sent_to_another_process_without_its_map() -> None:

@@ -16,7 +16,7 @@ from bidnerf_core.localization.by_surface import by_images, hypotheses
 from bidnerf_core.localization.problem import middle_of_view
 
 # Inside: the distribution of proposals and the margin over other poses, of which an answer keeps one
-from bidnerf_core.localization.search import Stage, centred, halve, neighbours
+from bidnerf_core.localization.search import Stage, centre_in_view, halve, neighbours
 from bidnerf_core.mapping import Normal, P, States
 from blob_images import BOUNDS, FIELD, FRAME, TRUTH
 from problems import single
@@ -103,11 +103,11 @@ def test_centring_takes_back_most_of_a_shift_and_leaves_a_view_of_nothing() -> N
     problem = single(FIELD, BOUNDS, FRAME, start)
     middle, found = middle_of_view(problem, start), start[None]
     for _ in range(3):
-        found = centred(problem, found, middle)
+        found = centre_in_view(problem, found, middle)
     assert torch.equal(found.rotation[0], start.rotation)
     assert float((found.translation[0] - TRUTH.translation).norm()) < 0.5 * 0.54  # the median of few pixels
     away = TRUTH.retract(torch.tensor([0, 0, 0, math.pi, 0, 0], dtype=torch.float64))[None]
-    assert torch.equal(centred(problem, away, middle).matrix(), away.matrix())
+    assert torch.equal(centre_in_view(problem, away, middle).matrix(), away.matrix())
 
 
 def test_images_find_the_pose_without_depth() -> None:

@@ -90,8 +90,8 @@ def test_another_scene_is_refused(map_folder: Path) -> None:
 def test_photos_found_too_imprecisely_are_not_called_another_scene(
     stored: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    solved = bn.Localizer.solved
-    monkeypatch.setattr(bn.Localizer, "solved", lambda *given: replace(solved(*given), outcome=bn.Outcome.IMPRECISE))
+    solve = bn.Localizer.solve
+    monkeypatch.setattr(bn.Localizer, "solve", lambda *given: replace(solve(*given), outcome=bn.Outcome.IMPRECISE))
     with refused(found="localizes 0 of 1 photo, and 1 more, but too imprecisely", expected="from as near"):
         localize_new(bn.load_map(stored), [training_views()[7].frame], [])
 

@@ -38,7 +38,7 @@ from bidnerf_core.localization import (
     Outcome,
     SearchRecord,
     Support,
-    recorded,
+    record_search,
 )
 from bidnerf_core.mapping import States
 from bidnerf_core.progress import job_context
@@ -59,7 +59,7 @@ def query() -> Query:
 @pytest.fixture(scope="module")
 def recording(localizer: Localizer, query: Query) -> tuple[Localization, SearchRecord]:
     """A localization of the photo, and the record of its search."""
-    with recorded() as record:
+    with record_search() as record:
         answer = localizer(query.views)
     return answer, record
 

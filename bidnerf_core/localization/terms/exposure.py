@@ -40,11 +40,11 @@ def fit_exposure(
         if number > 0:
             corrected = gain * seen + offset
             weight = known * weigh(corrected - measured) * ~clipped(corrected, measured)
-        off = measured - seen
+        difference = measured - seen
         total = weight.sum(1, keepdim=True) + precision[1]
-        mean, shift = ((weight * part).sum(1, keepdim=True) for part in (seen, off))
+        mean, shift = ((weight * part).sum(1, keepdim=True) for part in (seen, difference))
         square = (weight * seen.square()).sum(1, keepdim=True) + precision[0]
-        grow = (weight * seen * off).sum(1, keepdim=True)
+        grow = (weight * seen * difference).sum(1, keepdim=True)
         determinant = (total * square - mean.square()).clamp(min=torch.finfo(seen.dtype).tiny)
         gain = 1 + (total * grow - mean * shift) / determinant
         offset = (square * shift - mean * grow) / determinant

@@ -39,8 +39,8 @@ def channels(rendering: Rendering, measured: Float[Tensor, "r"] | None, miss: fl
     """
     if measured is None:
         return rendering.rgb
-    off = rendering.distance - rendering.opacity * measured + (1 - rendering.opacity) * miss
-    return torch.cat([rendering.rgb, torch.where(measured > 0, off, 0)[:, None]], -1)
+    difference = rendering.distance - rendering.opacity * measured + (1 - rendering.opacity) * miss
+    return torch.cat([rendering.rgb, torch.where(measured > 0, difference, 0)[:, None]], -1)
 
 
 def differentiate(
@@ -76,8 +76,8 @@ def differentiate(
     jacobian = derivatives_of(field, positions, directions, matters if index is None else None)
     seen, weights, features = channels(rendering, measured, miss), rendering.weights, values.rgb
     if measured is not None:
-        off = torch.where(measured[:, None] > 0, samples.middles - measured[:, None], 0)
-        features = torch.cat([features, off[..., None]], -1)
+        difference = torch.where(measured[:, None] > 0, samples.middles - measured[:, None], 0)
+        features = torch.cat([features, difference[..., None]], -1)
     length = samples.ends - samples.starts
     passed = torch.exp(-(torch.where(samples.valid, values.density * length, 0)).cumsum(-1))
     behind = seen[:, None] - (weights[..., None] * features).cumsum(1)

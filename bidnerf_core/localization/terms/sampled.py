@@ -69,9 +69,9 @@ class SampledLoss:
         if weight == 0 or not self.objective.uses_depth or bounds.contracted:
             return loss
         points = rays.origins + observed.distance[..., None] * rays.directions
-        off = (points - constant(bounds.centre, points)).abs() - constant(bounds.size, points) / 2
+        beyond = (points - constant(bounds.centre, points)).abs() - constant(bounds.size, points) / 2
         robust = Robust("huber", rendered_depth_scale(bounds))
-        outside = robust(torch.linalg.vector_norm(off.clamp(min=0), dim=-1))
+        outside = robust(torch.linalg.vector_norm(beyond.clamp(min=0), dim=-1))
         return loss + weight * masked_mean(outside, observed.measured).mean()
 
     def _rays(self, observed: Observations, T_world_last: SE3) -> Rays:

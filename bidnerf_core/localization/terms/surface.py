@@ -183,7 +183,7 @@ class Surface:
         gain, offset = fit_exposure(
             surface,
             self.rgb,
-            lambda off: inlier_weight(off.square(), COLOUR),
+            lambda difference: inlier_weight(difference.square(), COLOUR),
             known,
             (0.02 * len(self), 0.0),
             6,

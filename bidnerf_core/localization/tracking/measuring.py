@@ -169,8 +169,10 @@ class Measurer:
                 return None
             matches = Nearest.of(query, LandmarkMatcher(landmarks), len(query.view)).best
             there = camera.project(T.inverse().apply(landmarks.positions[matches.landmark].double()))
-            off = (there - query.keypoints.pixels[matches.keypoint]).norm(dim=-1)
-            proposed = consensus(query, landmarks, matches[(off <= radius).nonzero()[:, 0]], still)  # NaN is behind
+            distance = (there - query.keypoints.pixels[matches.keypoint]).norm(dim=-1)
+            proposed = consensus(
+                query, landmarks, matches[(distance <= radius).nonzero()[:, 0]], still
+            )  # NaN is behind
             if proposed is None:
                 return None
             T = proposed[0].T
@@ -304,9 +306,9 @@ class Measurer:
         points = None if surface is None else Surface.of(views, None, surface, state.frames, POINTS)
         if points is None and (image is None or not has_field(self.scene.field)):
             return None
-        off = math.sqrt(float((covariance.diagonal() * torch.tensor([1.0] * 3 + [reach**2] * 3)).sum() / 3))
+        spread = math.sqrt(float((covariance.diagonal() * torch.tensor([1.0] * 3 + [reach**2] * 3)).sum() / 3))
         # Measured points alone may correct a prediction that is uncertain by up to 0.35 of the distance to the scene.
-        if image is None and off > 0.35 * reach:
+        if image is None and spread > 0.35 * reach:
             why = "no colours were recorded, and the prediction is too uncertain for the shape"
             return Measurement.of(predicted, predicted, Verdict(Outcome.UNDETERMINED, why), 1.0, state)
         states = States.known(predicted.T_world_camera, torch.zeros(6, dtype=torch.float64))
@@ -325,7 +327,7 @@ class Measurer:
             points = replace(points, colour_weight=float(image is not None))
             # At first, the robust loss is three times as wide as suits the residuals. The start is close, so that few steps suffice.
             for wider in (3.0, 1.0):
-                fitted = replace(points, noise=max(points.noise, off)).fitted_noise(states)
+                fitted = replace(points, noise=max(points.noise, spread)).fitted_noise(states)
                 # This widens the basin of convergence and keeps the information.
                 fitted = replace(fitted, noise=wider * fitted.noise, independent=points.independent * wider**2)
                 term = Determined(fitted) if image is None else fitted

@@ -61,10 +61,6 @@ class PoseEstimate:
     noise: Float[Tensor, "6 6"]  # independent of other frames'
     bias: Float[Tensor, "6 6"]  # shared with the frames before and after
 
-    @property
-    def covariance(self) -> Float[Tensor, "6 6"]:
-        return self.noise + self.bias
-
 
 @dataclass(frozen=True, eq=False)
 class Motion:
@@ -84,7 +80,7 @@ class Motion:
         noise = torch.zeros((12, 12), dtype=torch.float64)
         noise[:6, :6] = pose.noise
         # An unknown velocity has a standard deviation of one reach, and of one radian, per second.
-        noise[6:, 6:] = _scaled(reach, 1.0)
+        noise[6:, 6:] = _diagonal(reach, 1.0)
         return Motion(pose.T_world_camera, torch.zeros(6, dtype=torch.float64), noise, pose.bias, reach)
 
     @property
@@ -114,7 +110,7 @@ class Motion:
         if not stamped:
             # As frames may be missing, the interval is uncertain by half of it.
             way, turn = (0.5 * float(torch.linalg.vector_norm(part)) for part in step.split(3))
-            noise[:6, :6] += _scaled(way, turn)
+            noise[:6, :6] += _diagonal(way, turn)
         return replace(motion, T_world_camera=T, noise=_symmetric(noise), bias=back @ self.bias @ back.T)
 
     def correct(self, measured: PoseEstimate) -> Motion:
@@ -122,10 +118,9 @@ class Motion:
 
         The biases of the measurement and the state are assumed to be fully correlated, so fusion does not reduce them.
         """
-        off = update_between(self.T_world_camera, measured.T_world_camera)
-        innovation = self.noise[:6, :6] + measured.noise
-        gain = torch.linalg.solve(innovation, self.noise[:6]).T
-        delta = gain @ off
+        innovation = update_between(self.T_world_camera, measured.T_world_camera)
+        gain = torch.linalg.solve(self.noise[:6, :6] + measured.noise, self.noise[:6]).T
+        delta = gain @ innovation
         rest = torch.eye(12, dtype=torch.float64)
         rest[:, :6] -= gain
         # Joseph's form stays positive semidefinite.
@@ -165,19 +160,19 @@ class Motion:
         """
         if not bool(measured.noise.isfinite().all() and measured.bias.isfinite().all()):
             return self
-        off = update_between(self.T_world_camera, measured.T_world_camera)
+        innovation = update_between(self.T_world_camera, measured.T_world_camera)
         spread = self.noise[:6, :6] + measured.noise
         # Beyond this squared Mahalanobis distance, the prediction is discarded.
-        if float(off @ torch.linalg.solve(spread, off)) > 60.0:
+        if float(innovation @ torch.linalg.solve(spread, innovation)) > 60.0:
             return Motion.at(measured, self.reach)
-        return replace(self.correct(measured), agility=self._observed_agility(off[:3], spread[:3, :3]))
+        return replace(self.correct(measured), agility=self._observed_agility(innovation[:3], spread[:3, :3]))
 
     def _acceleration(self, agility: float = 1.0) -> Float[Tensor, "6 6"]:
         """Return the covariance of the acceleration (metres and radians per second squared) of a hand-held camera that is moved briskly."""
-        return _scaled(agility * self.reach * 2.0, 4.0)
+        return _diagonal(agility * self.reach * 2.0, 4.0)
 
-    def _observed_agility(self, off: Float[Tensor, "3"], spread: Float[Tensor, "3 3"]) -> float:
-        """Return the agility after a position innovation ``off`` with covariance ``spread`` (Mehra 1970).
+    def _observed_agility(self, innovation: Float[Tensor, "3"], spread: Float[Tensor, "3 3"]) -> float:
+        """Return the agility after a position innovation with covariance ``spread`` (Mehra 1970).
 
         While the velocity is still unknown, the agility is unchanged. Rotations are ignored: they change more abruptly than the
         translation of a walking person, and measurements determine them well.
@@ -187,7 +182,7 @@ class Motion:
         if velocity > 0.5:
             return self.agility
         # Each pose updates a fraction of the squared agility by the squared innovation, relative to what is expected.
-        ratio = min(9.0, float(off @ torch.linalg.solve(spread, off)) / 3)
+        ratio = min(9.0, float(innovation @ torch.linalg.solve(spread, innovation)) / 3)
         return min(1.0, max(0.1, self.agility * math.sqrt(1 - 0.4 + 0.4 * ratio)))
 
     def move(self, T_world_camera: SE3, relative: Float[Tensor, "6 6"], seconds: float) -> Motion:
@@ -211,7 +206,7 @@ def pixel_radius(covariance: Float[Tensor, "6 6"], focal: float, distance: float
     return focal * math.sqrt(float(translation.mean()) / distance**2 + float(rotation.mean()))
 
 
-def _scaled(translation: float, rotation: float) -> Float[Tensor, "6 6"]:
+def _diagonal(translation: float, rotation: float) -> Float[Tensor, "6 6"]:
     return torch.diag(torch.tensor([translation] * 3 + [rotation] * 3, dtype=torch.float64) ** 2)
 
 

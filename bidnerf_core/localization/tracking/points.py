@@ -174,8 +174,8 @@ class Fit:
     @cached_property
     def _residuals(self) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"]]:
         """The reprojection errors in standard deviations and in pixels."""
-        squared, off, _ = self.term.residuals(self.states)
-        return squared[0].sqrt(), off[0].norm(dim=-1)
+        squared, residuals, _ = self.term.residuals(self.states)
+        return squared[0].sqrt(), residuals[0].norm(dim=-1)
 
     @property
     def is_recognised(self) -> bool:

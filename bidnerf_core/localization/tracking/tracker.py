@@ -230,7 +230,7 @@ class Tracker:
             problem = replace(problem, sensor=self.localizer.depth_sensor)
             return within_risk(localize_by_landmarks(problem, 0, state.frames), self._risk)
         try:
-            return self.localizer.solved(problem, state.frames)
+            return self.localizer.solve(problem, state.frames)
         except InputError:
             if lost:  # the sequence has begun, so the frame is at fault, not the map or the settings
                 return None
