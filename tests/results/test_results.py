@@ -160,7 +160,7 @@ FOUND = Localization(
         loss=st.floats(),
         focal_factor=st.floats(),
         diagnostics=st.none(),
-        shown=st.none(),
+        picture=st.none(),
         covariance=st.none() | st.floats(0.01, 1).map(lambda x: x * torch.eye(6).double()),
     )
 )
