@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -82,19 +81,6 @@ def test_gtsam_itself_agrees() -> None:
     values = gtsam.Values()
     values.insert(0, pose(TRUE))
     assert 2 * factor.error(values) == pytest.approx(EXPECTED, rel=1e-6)
-
-
-def test_opencv_projects_to_the_same_pixels() -> None:
-    """OpenCV counts pixels from the middle of the first one, we from its corner; its rvec and tvec take the world to the camera."""
-    T_camera_world = FOUND.inverse()
-    points = FOUND.apply(torch.tensor([[0.3, -0.2, 2.0], [-0.5, 0.1, 3.0], [0.0, 0.4, 1.5]]).double())
-    rotation, _ = cv2.Rodrigues(T_camera_world.rotation.numpy())
-    matrix = np.array([[CAMERA.fx, 0, CAMERA.cx - 0.5], [0, CAMERA.fy, CAMERA.cy - 0.5], [0, 0, 1]])
-    pixels, _ = cv2.projectPoints(
-        points.numpy(), rotation, T_camera_world.translation.numpy(), matrix, np.array(CAMERA.distortion)
-    )
-    ours = CAMERA.project(T_camera_world.apply(points))
-    np.testing.assert_allclose(pixels[:, 0] + 0.5, ours.numpy(), atol=1e-6)
 
 
 @pytest.mark.parametrize("coefficients", [4, 5, 8, 12, 14])

@@ -33,15 +33,6 @@ def test_a_training_killed_before_its_first_checkpoint_begins_anew(bidnerf: Run,
     assert {path.name for path in out.iterdir()} == whole
 
 
-def test_files_of_others_and_of_whole_maps_are_not_overwritten(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
-    (tmp_path / "notes").mkdir()
-    (tmp_path / "notes" / "weights.txt").touch()
-    for out in (tmp_path / "notes", shared / "map"):
-        status, _, err = bidnerf("train", shared / "data", "--out", out, *tiny.options(2))
-        assert status == 1
-        assert f"{out}: exists already and is not empty" in err
-
-
 def test_a_map_that_another_process_writes_is_not_baked(bidnerf: Run, shared: Path, map_folder: Path) -> None:
     with lock(map_folder):
         status, said, err = bidnerf("bake", map_folder, "--data", shared / "data", *BAKE)

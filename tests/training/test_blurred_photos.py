@@ -43,12 +43,6 @@ def test_only_the_blurred_photo_weighs_less() -> None:
     assert 0 < float(kept[BLURRED]) < 2**-0.5  # half an octave is the least that counts
 
 
-def test_exposure_does_not_count_as_blur() -> None:
-    views = photos()
-    dark = replace(views[3], frame=replace(views[3].frame, rgb=0.3 * views[3].frame.rgb))
-    assert bool((relative_detail([*views[:3], dark, *views[4:]]) == 1).all())
-
-
 def test_the_loss_is_that_of_weighted_squares() -> None:
     supervision = Supervision(photos(3.0), BOUNDS, replace(SupervisionConfig(), exposure=False))
     weight = require(supervision.image_weight)

@@ -205,24 +205,9 @@ def test_distortion_is_the_double_sum_of_its_definition() -> None:
     torch.testing.assert_close(distortion(rendering, 2.5), expected)
 
 
-def test_weight_in_one_place_has_the_least_distortion() -> None:
-    wall = torch.zeros(10, dtype=torch.float64)
-    wall[4] = 100.0
-    assert float(distortion(ray(wall, 0.0)[0], 5.0)) < 0.2 * float(distortion(random_rendering(), 5.0))
-
-
 def test_rays_without_depth_do_not_count() -> None:
     density = torch.full((10,), 0.3, dtype=torch.float64)
     assert float(ray_termination(*ray(density, 0.0))) == 0
     assert float(by_density(density, 0.0).abs().max()) == 0
     rendering, batch = ray(density, 3.25)
     assert supervised_loss(rendering, batch, 2.0, 0.0)[0] == 0
-
-
-def test_weight_is_pulled_to_where_depth_was_measured() -> None:
-    """Matter at the measured place lowers the term most in thin fog, and the farther from it, the less it does."""
-    slope = by_density(torch.full((10,), 0.01, dtype=torch.float64), 3.25)  # the middle of cell 6
-    assert int(slope.argmin()) == 6
-    assert bool((slope < 0).all())  # any matter beats none: what a ray lacks counts as at the camera
-    assert bool((slope[:7].diff() < 0).all())
-    assert bool((slope[6:].diff() > 0).all())

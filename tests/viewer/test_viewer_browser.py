@@ -126,7 +126,13 @@ def saved(room: Map, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @contextmanager
-def opened(browser: Any, address: str, viewport: dict[str, int], **more: Any) -> Iterator[Any]:
+def opened(
+    browser: Any,
+    address: str,
+    viewport: dict[str, int],
+    ready: str = "(window.page?.space?.drawn ?? 0) > 0",
+    **more: Any,
+) -> Iterator[Any]:
     """Open a page, and fail on any message of an error, and on requests for anything but what it came from."""
     context = browser.new_context(viewport=viewport, reduced_motion="reduce", **more)
     page, faults, asked = context.new_page(), list[str](), list[str]()
@@ -136,7 +142,7 @@ def opened(browser: Any, address: str, viewport: dict[str, int], **more: Any) ->
     page.on("request", lambda request: asked.append(request.url))
     try:
         page.goto(address)
-        until(page, "(window.page?.space?.drawn ?? 0) > 0")
+        until(page, ready)
         yield page
         origin = "file://" if address.startswith("file:") else address.rstrip("/")
         assert not [url for url in asked if not url.startswith((origin, "data:", "blob:"))]
@@ -332,16 +338,10 @@ def test_a_phone_shows_everything_in_its_width(browser: Any, saved: Path) -> Non
 
 
 def test_a_notebook_shows_the_page(browser: Any, saved: Path) -> None:
-    context = browser.new_context(viewport=LAPTOP, offline=True)
-    page, faults = context.new_page(), list[str]()
-    page.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
-    page.on("pageerror", lambda error: faults.append(str(error)))
-    page.goto((saved.parent / "notebook.html").as_uri())
-    frame = page.frames[1]
-    frame.wait_for_selector(".outcome.good")
-    frame.click("#next")
-    frame.wait_for_selector(".outcome.bad")
-    frame.click("#rows tbody tr")
-    frame.wait_for_selector(".outcome.good")
-    context.close()
-    assert not faults
+    with opened(browser, (saved.parent / "notebook.html").as_uri(), LAPTOP, "true", offline=True) as page:
+        frame = page.frames[1]
+        frame.wait_for_selector(".outcome.good")
+        frame.click("#next")
+        frame.wait_for_selector(".outcome.bad")
+        frame.click("#rows tbody tr")
+        frame.wait_for_selector(".outcome.good")
