@@ -29,6 +29,7 @@ from bidnerf_core.localization.search import (
     halve,
     image_stages,
     localization_by_rays,
+    neighbours,
     states_at,
 )
 from bidnerf_core.localization.settings import AutoConfig, ColourSettings, DepthLossSettings
@@ -160,11 +161,11 @@ def by_images(
     directions = normalize(small.flat, dim=-1) @ keyframes.rotation.mT
     origins = keyframes.translation[:, None].expand_as(directions)
     seen = cast(surface, origins.reshape(-1, 3), directions.reshape(-1, 3))
-    away = float(seen.along[seen.met].median()) if bool(seen.met.any()) else surface.extent
+    distance = float(seen.along[seen.met].median()) if bool(seen.met.any()) else surface.extent
+    middle = torch.tensor([0.0, 0.0, distance], dtype=torch.float64)
     # A map has a background if more than a fifth of the keyframes' rays hit nothing.
-    has_background = float(seen.met.float().mean()) < 1 - 0.2
-    middle = torch.tensor([0.0, 0.0, away], dtype=torch.float64)
-    renderer = surface_renderer(surface, problem.bounds.background if has_background else None)
+    background = problem.bounds.background if float(seen.met.float().mean()) < 1 - 0.2 else None
+    renderer = surface_renderer(surface, background)
     # Wide scales cope with images exposed twice or half as long as the map's.
     scales = ColourScales(colour=0.07) if detailed else ColourScales(gain=1.0, rounds=5)
     sizes = DETAILED_STAGES if detailed else IMAGE_STAGES
@@ -205,11 +206,8 @@ def hypotheses(
     if by_points:
         centre = surface.surfels.positions.median(0).values.cpu().double()
         others = SE3(others.rotation, centre - others.rotation @ middle)
-    found = SE3.cat([displace(keyframes[order[near:half]], 0.02, 0.05), others])
-    if start is None:
-        return found
-    around = SE3(start.rotation.expand(near, 3, 3), start.translation.expand(near, 3))
-    return SE3.cat([start[None], displace(around, 0.1, 0.25)[1:], found])
+    around = [] if start is None else [neighbours(start, near, 0.1 * surface.extent, 0.25, seed)]
+    return SE3.cat([*around, displace(keyframes[order[near:half]], 0.02, 0.05), others])
 
 
 def for_comparison(points: Surface) -> Surface:

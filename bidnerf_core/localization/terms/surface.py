@@ -128,7 +128,7 @@ class Surface:
 
     def __call__(self, states: States) -> Normal:
         here = move_to(states, self.surface.device)
-        r, squared, normal, index, along, local, rays = self._offsets(here)
+        r, squared, normal, index, along, local, rays, rig = self._offsets(here)
         # Geman-McClure: points of an occluder have almost no influence
         inlier = inlier_weight(squared, 2 * self.noise)
         share = self.independent / len(self)
@@ -144,7 +144,7 @@ class Surface:
             residuals = torch.cat([residuals, difference.double()], -1)
             slopes = torch.cat([slopes, slope.double()], -2)
             weights = torch.stack([by_distance, *3 * [by_colour]], -1)
-        rows = self._rows(here, slopes, local, rays).flatten(1, 2)
+        rows = self._rows(here, slopes, local, rays, rig).flatten(1, 2)
         weighted = (rows * weights.flatten(1)[..., None]).mT
         gradient = (weighted @ residuals.flatten(1)[..., None])[..., 0]
         return move_to(Normal(cost, gradient, weighted @ rows), states.z.device)
@@ -211,6 +211,9 @@ class Surface:
         return difference * seen, slope * seen[..., None]
 
     def _offsets(self, states: States) -> tuple[Tensor, ...]:
+        """Return each point's offset across the nearest surfel's plane, squared distance from the surfel, normal, number and offset along the
+        plane; and the point in the camera's frame, the ray through it and the point in the rig's frame.
+        """
         rays, sights = rays_through(states, self.sights.image), self.sights
         local = rays * (self.z * states.nuisances[:, DEPTH, None].exp())[..., None] + self.fixed
         v, w = (states.nuisances[:, None, part].expand_as(local) for part in (slice(6, 9), slice(9, 12)))
@@ -224,15 +227,14 @@ class Surface:
         along = offset - across[..., None] * normal
         # A point farther from a surfel than its radius, 1.5 cells, does not lie on the surface.
         beyond = (along.norm(dim=-1) - 1.5 * self.surface.cell).clamp(min=0)
-        return across, across.square() + beyond.square(), normal, index, along, local, rays
+        return across, across.square() + beyond.square(), normal, index, along, local, rays, rig
 
     def _rows(
-        self, states: States, normals: Float[Tensor, "h n k 3"], local: Tensor, rays: Tensor
+        self, states: States, normals: Float[Tensor, "h n k 3"], local: Tensor, rays: Tensor, rig: Tensor
     ) -> Float[Tensor, "h n k P"]:
         """Return the derivatives of the points (world) along ``normals`` with respect to the unknowns."""
         sights = self.sights
         by_rig = (normals.flatten(1, 2) @ states.T.rotation).view_as(normals)
-        rig = (sights.rotation @ local[..., None])[..., 0] + sights.translation
         own = by_rig @ sights.rotation
         scale = (self.z * states.nuisances[:, DEPTH, None].exp())[..., None, None]
         by_camera = own @ (rays_by_camera(rays, states) * scale)

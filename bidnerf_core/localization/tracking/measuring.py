@@ -245,15 +245,12 @@ class Measurer:
         if surface is None or not shows_shape(frame):
             return None, 1.0
         depth = measured_depth(frame, points.pixels)
-        ratio = states.T[0].inverse().apply(points.positions)[:, 2] / depth
-        ratio = ratio[depth > 0]
-        if len(ratio) >= LEAST_AGREEING:
-            scale = float(ratio.median())
-            # Depth is wrong if its scale is five standard deviations from that of the landmarks, which a few determine to 1 %.
-            if abs(scale - 1) > 5.0 * math.hypot(DEPTH_WIDTH * sensor.scale, 0.01):
-                return None, 1 / scale
-        view = View(frame, SE3.identity())
-        return Surface.of([view], None, surface, state.frames, POINTS), 1.0
+        ratios = (states.T[0].inverse().apply(points.positions)[:, 2] / depth)[depth > 0]
+        scale = float(ratios.median()) if len(ratios) >= LEAST_AGREEING else 1.0
+        # Depth is wrong if its scale is five standard deviations from that of the landmarks, which a few determine to 1 %.
+        if abs(scale - 1) > 5.0 * math.hypot(DEPTH_WIDTH * sensor.scale, 0.01):
+            return None, 1 / scale
+        return Surface.of([View(frame, SE3.identity())], None, surface, state.frames, POINTS), 1.0
 
     def _judge(
         self, landmarks: LandmarkMap, state: TrackerState, fit: Fit, predicted: Motion, motion: Motion, words: str

@@ -148,12 +148,9 @@ class Tracker:
         if state.motion is None or predicted is None:
             if found is None:
                 why = Verdict(Outcome.TOO_FEW_MATCHES, "the beginning of the sequence has not been recognised yet")
-                T = SE3.identity() if self._start is None else self._start
-                deviation = torch.tensor([self._extent] * 3 + [math.pi] * 3, dtype=torch.float64)
-                path, losses = SE3.stack([T, T]), torch.ones(1, dtype=torch.float64)
-                found = Localization.of(
-                    why, path, losses, "track", clocks.perf_counter(), 1.0, deviation.square().diag()
-                )
+                unknown = torch.tensor([self._extent] * 3 + [math.pi] * 3, dtype=torch.float64).square().diag()
+                somewhere = self._at(frame, self._start or SE3.identity(), unknown)
+                found = Measurement.of(somewhere, somewhere, why, 1.0, state).answer
             return found, state
         # With each lost frame, 0.6 of the velocity is kept.
         state = replace(
@@ -169,11 +166,9 @@ class Tracker:
 
     def _at(self, frame: Frame, T: SE3, covariance: torch.Tensor | None) -> Motion:
         """Return the motion of a camera at a pose with unknown velocity; without a ``covariance``, the pose is as uncertain as a start."""
-        # A start of unknown uncertainty is off by 3 % of the scene's extent, and by 0.1 radians.
-        deviation = torch.tensor([0.03 * self._extent] * 3 + [0.1] * 3, dtype=torch.float64)
-        noise, bias = (deviation.square().diag(), 0.0 * deviation.diag())
-        if covariance is not None:
-            noise = bias = covariance / 2
+        # A start of unknown uncertainty has errors of 3 % of the scene's extent, and of 0.1 radians.
+        usual = torch.tensor([0.03 * self._extent] * 3 + [0.1] * 3, dtype=torch.float64).square().diag()
+        noise, bias = (usual, 0 * usual) if covariance is None else (covariance / 2, covariance / 2)
         return Motion.at(PoseEstimate(T, noise, bias), self._reach(frame))
 
     def _advance(self, frame: Frame, image: Grey | None, motion: Motion, state: TrackerState) -> TrackerState:
@@ -215,8 +210,7 @@ class Tracker:
         The search by landmarks runs for every image; the slower search of the whole surface runs at increasing intervals. Frames
         without an image are not searched for, since a shape alone fits many places.
         """
-        has_begun = state.motion is not None
-        lost = max(state.searchable, min(state.lost, 1)) if has_begun else state.searchable
+        lost = max(state.searchable, 0 if state.motion is None else min(state.lost, 1))
         if image is None or (not shows_shape(frame) and is_blank(frame)):
             return None
         # The whole surface is searched after this many lost frames, and again whenever their number has doubled.
