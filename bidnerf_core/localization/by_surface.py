@@ -224,7 +224,7 @@ def measure_support(points: Surface, best: States) -> dict[str, float]:
     coloured = (points.coloured > 0).to(near.device)
     both = (near * alike)[:, coloured] if bool(coloured.any()) else near
     surface, T = points.surface, best.T[0].to(points.surface.device)
-    origins = T.apply(points.origins[:SIGHT_LINES])
+    origins = T.apply(points.sights.translation[:SIGHT_LINES])
     lines = (T.apply(points.points[:SIGHT_LINES]) - origins).float()
     length = lines.norm(dim=-1)
     hit = trace(surface, origins.float(), lines / length.clamp(min=1e-9)[:, None])
@@ -249,7 +249,7 @@ def covariance_by_depth(
     hessian = about.mT @ points(best).hessian[0, :6, :6] @ about + unconstrained.square().reciprocal().diag()
     found = about @ torch.linalg.inv(hessian) @ about.mT
     precision = float(found[:3, :3].trace().sqrt() / middle.norm())
-    sight = normalize((points.points - points.origins).cpu(), dim=-1).mean(0)
+    sight = normalize((points.points - points.sights.translation).cpu(), dim=-1).mean(0)
     shared = torch.stack([problem.sensor.scale * middle, problem.sensor.offset * sight], -1)
     found[:3, :3] += shared @ shared.mT
     return (found + found.mT) / 2, precision

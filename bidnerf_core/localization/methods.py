@@ -110,25 +110,25 @@ def find_method(name: str) -> Method:
 
 def require_use_of_depth(method: str) -> None:
     """Raise ``InputError`` for a method that would ignore explicitly given depth points."""
-    if not find_method(method).uses_depth:
-        others = _list_methods(lambda other: other.uses_depth)
-        raise InputError(f"method {method!r} uses colour alone, got depth points; use method {others}")
+    _require(method, lambda chosen: chosen.uses_depth, "uses colour alone, got depth points; use method")
 
 
 def require_start(method: str, given: bool) -> None:
     """Raise ``InputError`` if a method needs a start and none is ``given``."""
-    if find_method(method).needs_start and not given:
-        others = _list_methods(lambda other: not other.needs_start)
-        raise InputError(f"method {method!r} needs a start; give one by --start, or use method {others}")
+    _require(
+        method, lambda chosen: given or not chosen.needs_start, "needs a start; give one by --start, or use method"
+    )
 
 
-def _list_methods(wanted: Callable[[Method], bool]) -> str:
-    """Return, as text, the names of the methods for which ``wanted`` is true, leaving out methods that cannot be loaded."""
-    found = []
+def _require(method: str, fits: Callable[[Method], bool], problem: str) -> None:
+    """Raise ``InputError`` with the ``problem`` unless a method ``fits``; the message names the methods that do and can be loaded."""
+    if fits(find_method(method)):
+        return
+    others = []
     for name in METHODS:
         with contextlib.suppress(PluginError):
-            found += [name] if wanted(METHODS[name]) else []
-    return " or ".join(map(repr, found)) or "(none has that)"
+            others += [repr(name)] if fits(METHODS[name]) else []
+    raise InputError(f"method {method!r} {problem} {' or '.join(others) or '(none has that)'}")
 
 
 def matches_landmarks(method: str, config: Any) -> bool:

@@ -121,11 +121,6 @@ class Surface:
         local = torch.cat([image, torch.ones_like(image[:, :1])], -1) * self.z[:, None] + self.fixed
         return (sights.rotation @ local[..., None])[..., 0] + sights.translation
 
-    @property
-    def origins(self) -> Float[Tensor, "n 3"]:
-        """The positions of the sensors in the rig's frame."""
-        return self.sights.translation
-
     def __call__(self, states: States) -> Normal:
         here = move_to(states, self.surface.device)
         r, squared, normal, index, along, local, rays, rig = self._offsets(here)

@@ -370,7 +370,7 @@ class Measurer:
 
 
 def search_radius(frame: Frame, predicted: Motion) -> float | None:
-    """Return the radius (pixels) within which landmarks very likely project; None if this would cover most of the image."""
+    """Return the radius (pixels) of the search for landmarks around their projections; None if it would cover most of the image."""
     camera = frame.intrinsics
     radius = INLIER * pixel_radius(predicted.covariance, camera.fx, predicted.reach)
     # A radius of more than 0.4 of the diagonal would cover most of the image.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -50,10 +51,6 @@ STATE_KINDS = {
 """The tensors of a state; without a motion, those of the motion are absent."""
 
 
-def _zeros(*shape: int) -> Tensor:
-    return field(default_factory=lambda: torch.zeros(shape, dtype=torch.float64))
-
-
 @dataclass(frozen=True, eq=False)
 class TrackerState:
     """The complete state of a tracker between frames."""
@@ -69,9 +66,10 @@ class TrackerState:
     age: int = 0  # frames since then
     moves: bool = False  # whether the camera moved during the readout of the last image
     # Corrections of the stated camera (see ``NUISANCES``) that a search found, for frames whose focal length is of the same kind.
-    camera: Float[Tensor, "6"] = _zeros(6)
+    camera: Float[Tensor, "6"] = field(default_factory=partial(torch.zeros, 6, dtype=torch.float64))
     is_approximate: bool = False  # whether that kind is an approximate focal length
-    doubt: Float[Tensor, "6 6"] = _zeros(6, 6)  # covariance of the pose due to errors of the intrinsics
+    # Covariance of the pose due to errors of the intrinsics.
+    doubt: Float[Tensor, "6 6"] = field(default_factory=partial(torch.zeros, 6, 6, dtype=torch.float64))
 
     def correct(self, frame: Frame) -> Frame:
         """Return a frame with its camera corrected; unchanged if the correction suits only exact, or only approximate, focal lengths."""
