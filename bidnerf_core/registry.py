@@ -93,8 +93,7 @@ class PluginInfo:
     def description(self) -> str:
         """The summary, with the distribution if it is not bidnerf's own, and the fault if there is one."""
         source = "" if self.is_bundled else f"[{self.distribution} {self.version}".strip() + "]"
-        clauses = self.summary.replace("``", "'"), source, self.fault and f"fault: {self.fault}"
-        return " ".join(filter(None, clauses))
+        return " ".join(filter(None, (self.summary.replace("``", "'"), source, self.fault and f"fault: {self.fault}")))
 
     def __str__(self) -> str:
         origin = f"from {self.distribution} {self.version}" if self.version else "registered in this process"

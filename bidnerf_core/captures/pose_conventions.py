@@ -368,8 +368,10 @@ def _of_orders(count: int) -> Iterator[Reading]:
         by_text = sorted(range(count), key=lambda i, first=first: str(i + first))  # type: ignore[misc]
         text, numeric = "in text order (1, 10, 11, 2)", "in numeric order"
         inverse = sorted(range(count), key=by_text.__getitem__)
-        orders.append((f"they are {text}, while the images are {numeric}", inverse))
-        orders.append((f"they are {numeric}, while the images are {text}", by_text))
+        orders += [
+            (f"they are {text}, while the images are {numeric}", inverse),
+            (f"they are {numeric}, while the images are {text}", by_text),
+        ]
     for clause, order in orders:
         yield from _in_file_axes(clause, "reassign the poses to the images", partial(understand, order=order))
 

@@ -249,10 +249,10 @@ def report_finished_parts(folder: Path | None) -> Iterator[None]:
             info = None if folder is None else load_info(folder)
         if info is None or isinstance(stopped.__cause__, TrainingStopped):
             raise
-        stages = zip(("landmarks", "field", "surface"), (info.landmarks, info.step, info.surface), strict=True)
-        parts = enumeration([stage for stage, done in stages if done]) or "nothing"
+        stages = (("landmarks", info.landmarks), ("field", info.step), ("surface", info.surface))
         raise Cancelled(
-            f"{folder}: {stopped}; the map has its {parts} so far; --resume continues, --finish ends it as it is"
+            f"{folder}: {stopped}; the map has its {enumeration([part for part, done in stages if done]) or 'nothing'}"
+            " so far; --resume continues, --finish ends it as it is"
         ) from stopped
 
 
