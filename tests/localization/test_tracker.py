@@ -24,12 +24,11 @@ from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import read_tensors_and_metadata
 from bidnerf_core.localization import AutoConfig, Posterior, TrackerConfig
-from bidnerf_core.localization.explanations import correction_between
 from bidnerf_core.localization.tracking.motion import Clock
 
 # Inside: flow, and the parts of a state that only rare sequences fill
 from bidnerf_core.localization.tracking.points import correlate
-from bidnerf_core.localization.tracking.state import TrackerState
+from bidnerf_core.localization.tracking.state import TrackerState, invert_correction
 from conditions import ground_landmarks, with_landmarks
 from flights import (
     FRAMES,
@@ -385,12 +384,15 @@ def test_flow_of_mere_noise_is_recognised() -> None:
     assert correlate(noise[0], moved, place, place + torch.tensor([3.0, 2.0])).tolist()[:2] == [True, True]
 
 
-def test_a_corrected_camera_is_corrected_alike_at_another_focus_and_size() -> None:
-    stated, true = replace(CAMERA, fx=140.0, cx=60.0), replace(CAMERA, fx=133.0, cy=50.0)
-    state = TrackerState(Clock(None, 0.1), camera=require(correction_between(stated, true)))
+@pytest.mark.parametrize("k1", [0.0, -0.28])
+def test_a_corrected_camera_is_corrected_alike_at_another_focus_and_size(k1: float) -> None:
+    stated = replace(CAMERA, fx=140.0, cx=60.0, distortion=(k1, 0.0, 0.0, 0.0))
+    true = replace(CAMERA, fx=133.0, cy=50.0, distortion=(k1 + 0.02, 0.0, 0.0, 0.0))
+    state = TrackerState(Clock(None, 0.1), camera=invert_correction(stated, true))
     frame = replace(flight()[0][1], intrinsics=stated)
     found = state.correct(frame).intrinsics
     assert (found.fx, found.fy, found.cx, found.cy) == pytest.approx((true.fx, true.fy, true.cx, true.cy))
+    assert found.distortion == pytest.approx(true.distortion)
     refocused = state.correct(replace(frame, intrinsics=replace(stated, fx=154.0))).intrinsics
     assert refocused.fx == pytest.approx(154 * 133 / 140)
     small = state.correct(replace(frame, rgb=torch.zeros((48, 64, 3)), depth=None, intrinsics=stated.scaled(0.5)))

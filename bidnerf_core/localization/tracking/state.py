@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -12,6 +13,7 @@ from jaxtyping import Float, UInt8
 from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor
 
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import LARGEST_LENGTH
 from bidnerf_core.frames import Frame
@@ -76,6 +78,18 @@ class TrackerState:
         if frame.focal_is_approximate != self.is_approximate or not bool(self.camera.any()):
             return frame
         return frame.replace(intrinsics=true_intrinsics(frame.intrinsics, self.camera))
+
+
+def invert_correction(stated: Intrinsics, true: Intrinsics) -> Float[Tensor, "6"]:
+    """Return the correction with which ``true_intrinsics`` turns ``stated`` into ``true``, exactly (focal lengths, centre and k1 only).
+
+    ``correction_between``, which compares any two cameras by their pixels, is only an approximation for distorted images.
+    """
+    across, down = true.fx / stated.fx, true.fy / stated.fy
+    bent = [camera.distortion[0] if camera.distortion else 0.0 for camera in (true, stated)]
+    centre = (true.cx - stated.cx) / stated.fx, (true.cy - stated.cy) / stated.fy
+    values = [math.log(across * down) / 2, *centre, bent[0] - bent[1], math.log(across / down), 0.0]
+    return torch.tensor(values, dtype=torch.float64)
 
 
 def save_state(path: Path, state: TrackerState, key: str) -> None:

@@ -15,7 +15,6 @@ from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.auto import localize_by_landmarks, within_risk
 from bidnerf_core.localization.by_surface import is_blank
-from bidnerf_core.localization.explanations import correction_between
 from bidnerf_core.localization.localizer import NO_DISTANCES, Localizer, Start, start_pose
 from bidnerf_core.localization.problem import SceneMap, origin_of, unit_of
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
@@ -25,6 +24,7 @@ from bidnerf_core.localization.tracking.motion import Clock, Motion, PoseEstimat
 from bidnerf_core.localization.tracking.points import POINTS, Grey, Points
 from bidnerf_core.localization.tracking.state import (
     TrackerState,
+    invert_correction,
     load_tracker_state,
     save_state,
 )
@@ -184,8 +184,8 @@ class Tracker:
     ) -> tuple[Localization, TrackerState]:
         """Start tracking at a pose found by a search."""
         reason = f"relocalized after {state.lost} frames: {found.reason}" if state.lost else found.reason
-        true = found.intrinsics
-        if true is not None and (camera := correction_between(stated.intrinsics, true)) is not None:
+        if found.intrinsics is not None:
+            camera = invert_correction(stated.intrinsics, found.intrinsics)
             state = replace(state, camera=camera, is_approximate=stated.focal_is_approximate)
         frame, state = state.correct(stated), replace(state, points=Points.none(), searchable=0)
         motion = self._at(frame, found.T_world_camera, found.covariance)
