@@ -136,6 +136,11 @@ MEASURES = {
         "probability of the explanations of the camera that the image may have",
     ),
     "precision": ("uncertainty of the position", ".2%", "standard deviation, as a share of the distance to the scene"),
+    "difference": (
+        "difference from the rendering",
+        ".1f",
+        "of a small image, relative to that of the map's own images from theirs",
+    ),
     "mass": ("pose within the tolerance", ".0%", "probability by all explanations of the image together"),
     "replaced": (
         "another camera than stated",

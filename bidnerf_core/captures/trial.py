@@ -7,6 +7,7 @@ keypoints of an image share.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -15,11 +16,26 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.fields import has_field
 from bidnerf_core.frames import View
-from bidnerf_core.geometry import SE3, chi_squared_quantile
-from bidnerf_core.localization import HEAVY_TAILS, LandmarkAnswer, LandmarkMatcher, Loop
+from bidnerf_core.geometry import KEYPOINTS_PER_INDEPENDENT, SE3
+from bidnerf_core.localization import (
+    HEAVY_TAILS,
+    LANDMARK_BOUNDS,
+    Images,
+    LandmarkAnswer,
+    LandmarkMatcher,
+    Loop,
+    RenderedRays,
+    SceneMap,
+    Surface,
+    rig,
+    small_images,
+    states_at,
+)
 from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
+    CostTerm,
     HeldOutTrial,
     LandmarkConfig,
     LandmarkMap,
@@ -27,11 +43,20 @@ from bidnerf_core.mapping import (
     concatenate,
 )
 
-QUANTILE = 0.9
-"""Quantile at which the error model is fitted: it covers the tails, and allows one image in ten to have a
-wrong pose."""
-MOST_CORRELATED = 300.0
-"""Largest number of keypoints that count as one measurement."""
+FREEDOM = 30.0
+"""Degrees of freedom of the Student-t distribution of errors in units of their covariance: a few poses are wrong."""
+CORRELATION = (3.0, 1.5)
+"""Prior of the number of keypoints that count as one: median over maps, and standard deviation of the logarithm.
+
+Maps of rendered images have 0.3 to 0.4 (the errors of their landmarks are overestimated), maps of photos 5 to 80.
+"""
+SCATTER = (0.004, 0.7)
+"""The same of the standard deviations of spurious corrections of a camera."""
+EXCESS, LEAST_EXCESS = (1.0, 1.0), 0.3
+"""The same of the factors by which points and rays exceed the information of independent measurements, and the least factor.
+
+Images with poses to which a field was trained show smaller errors than others.
+"""
 
 
 def tried_landmarks(
@@ -47,26 +72,85 @@ def tried_landmarks(
     because many given poses are wrong. Raises ``InputError`` if there are no landmarks.
     """
     landmarks = tracked.landmarks(config, report)
-    # One in eight images is held out, evenly spread, but 24 at most. Of a small number of images, one in three is held out, up to
-    # eight, since fewer would leave the scatter unknown.
-    wanted = max(min(len(views) // 8, 24), min(len(views) // 3, 8))
-    held_out = [int((i + 0.5) * len(views) / wanted) for i in range(wanted)]
+    held_out = held_out_images(len(views))
+    wanted = len(held_out)
     answers, updates = _answers(tracked, views, held_out, config, landmarks)
     if not answers:
-        return replace(landmarks, trial=HeldOutTrial(wanted))
+        return replace(landmarks, trial=HeldOutTrial(wanted), correlation=CORRELATION[0])
     translation, rotation = (torch.linalg.vector_norm(part, dim=-1).quantile(0.5) for part in updates.split(3, dim=-1))
     trial = HeldOutTrial(wanted, len(answers), float(translation), float(rotation.rad2deg()))
     landmarks = replace(landmarks, trial=trial)
-    if len(answers) < 6:  # too few to estimate the scatter from
-        return landmarks
     matches = [len(answer.mode.matches) for answer in answers]
     landmarks = replace(landmarks, usual_matches=float(torch.tensor(matches).float().median()))
-    landmarks = replace(landmarks, correlation=_correlation(answers, updates, matches, landmarks))
-    if landmarks.correlation > 0.99 * MOST_CORRELATED:
-        unexplained = updates.square().quantile(QUANTILE, dim=0) / chi_squared_quantile(QUANTILE, 1)
-        landmarks = replace(landmarks, pose_covariance=landmarks.pose_covariance + torch.diag(unexplained))
+
+    correlation = _most_probable(
+        CORRELATION,
+        lambda c: _student(updates, predicted_covariances(answers, matches, replace(landmarks, correlation=c))),
+    )
+    landmarks = replace(landmarks, correlation=max(correlation, 1.0))
+    if (
+        correlation < 1
+    ):  # errors are smaller than even independent keypoints explain, so the given poses are better than resection shows
+        errors = landmarks.pose_covariance
+        share = _most_probable(
+            EXCESS,
+            lambda s: _student(
+                updates, predicted_covariances(answers, matches, replace(landmarks, pose_covariance=s * errors))
+            ),
+        )
+        landmarks = replace(landmarks, pose_covariance=min(share, 1.0) * errors)
     factors = _factors(matches, landmarks)
     return replace(landmarks, calibration_scatter=_calibration_scatter(answers, factors))
+
+
+def held_out_images(count: int) -> list[int]:
+    """Return the numbers of the images, of ``count``, on which a map is tried.
+
+    One image in eight is held out, evenly spread, but 24 at most. Of a small number of images, one in three is held out, up to
+    eight, since fewer would leave the scatter unknown.
+    """
+    wanted = max(min(count // 8, 24), min(count // 3, 8))
+    return [int((i + 0.5) * count / wanted) for i in range(wanted)]
+
+
+def tried_field(scene: SceneMap, views: Sequence[View], trial: HeldOutTrial) -> HeldOutTrial:
+    """Return the ``trial`` with what the map's field and surface show of the held-out images at their given poses.
+
+    At a right pose, the gradient g and the Hessian H of a term that counts its independent measurements give g^T H^-1 g with a
+    chi-squared distribution of six degrees of freedom; the factor by which it is larger is the excess of the term's information.
+    """
+    scores: dict[str, list[Tensor]] = {"points": [], "rays": []}
+    differences = list[float]()
+    for number in held_out_images(len(views)):
+        problem = rig(scene, [View(views[number].frame, SE3.identity())], None)
+        here = states_at(views[number].T_ref_camera[None])
+        terms = dict[str, CostTerm]()
+        if scene.surface is not None and problem.has_depth:
+            points = Surface.of(problem.views, None, scene.surface, number)
+            if points is not None:
+                terms["points"] = points.fitted_noise(here)
+        if has_field(scene.field):
+            rays = RenderedRays.of(problem.views, problem.field, problem.bounds, 1024, number)
+            terms["rays"] = rays.fitted(here)
+            differences.append(float(small_images(problem, 64)(here).cost) / Images.INDEPENDENT)
+        for name, term in terms.items():
+            normal = term(here)
+            factor, info = torch.linalg.cholesky_ex(normal.hessian[0, :6, :6])
+            if not int(info):
+                gradient = normal.gradient[0, :6, None]
+                scores[name].append(torch.linalg.solve_triangular(factor, gradient, upper=False)[:, 0])
+
+    def excess(name: str, usual: float) -> float:
+        """Return the most probable factor; ``usual`` without images that show it."""
+        some = scores[name]
+        if not some:
+            return usual
+        eye = torch.eye(6, dtype=torch.float64).expand(len(some), 6, 6)
+        factor = _most_probable(EXCESS, lambda factor: _student(torch.stack(some), factor * eye))
+        return max(factor, LEAST_EXCESS)
+
+    difference = float(torch.tensor(differences).median()) if differences else trial.difference
+    return replace(trial, points=excess("points", trial.points), rays=excess("rays", trial.rays), difference=difference)
 
 
 def _answers(
@@ -78,8 +162,9 @@ def _answers(
 ) -> tuple[list[LandmarkAnswer], Float[Tensor, "n 6"]]:
     """Localize the held-out images with the landmarks of the others.
 
-    Returns the accepted answers, and the right updates from the given poses to the answers. In a map of many images,
-    ``landmarks`` that are not visible in the held-out images are not rebuilt.
+    Returns the answers that are no false alarms, and the right updates from the given poses to them. None is left out for being
+    uncertain, since its error is what the trial measures. In a map of many images, ``landmarks`` that are not visible in the
+    held-out images are not rebuilt.
     """
     answers, updates = list[LandmarkAnswer](), [torch.zeros((0, 6), dtype=torch.float64)]
     if not held_out:
@@ -96,7 +181,9 @@ def _answers(
             landmarks = concatenate([landmarks[others], anew])
     except InputError:  # the remaining images do not overlap
         return answers, updates[0]
-    plain = replace(landmarks, correlation=1.0, pose_covariance=torch.zeros_like(landmarks.pose_covariance))
+    plain = replace(
+        landmarks, correlation=KEYPOINTS_PER_INDEPENDENT, pose_covariance=torch.zeros_like(landmarks.pose_covariance)
+    )
     matcher = LandmarkMatcher(plain)
     for number in held_out:
         T = views[number].T_ref_camera.to("cpu", torch.float64)
@@ -104,45 +191,41 @@ def _answers(
         # A given pose without a camera motion is compared with a pose found without one.
         features, moving = tracked.detector_of(view, number), views[number].motion is not None
         found = Loop([view], matcher, features=features, moving=moving)()
-        if found is not None and found.verdict.accepted:
+        if found is not None and LANDMARK_BOUNDS[0].keeps(found.evidence.log10_nfa):
             answers.append(found)
             updates.append((T.inverse() @ found.T_world_rig).log()[None])
     return answers, torch.cat(updates)
 
 
-def _correlation(
-    answers: Sequence[LandmarkAnswer],
-    updates: Float[Tensor, "n 6"],
-    matches: Sequence[int],
-    landmarks: LandmarkMap,
-) -> float:
-    """Return the ``correlation`` at which the errors match the covariances predicted by the fits."""
-    covariances = torch.stack([answer.covariance / HEAVY_TAILS for answer in answers])
-
-    def are_larger(correlation: Tensor) -> Tensor:
-        factors = _factors(matches, replace(landmarks, correlation=float(correlation)))
-        information = torch.linalg.inv(factors[:, None, None] * covariances + landmarks.pose_covariance)
-        squared = torch.einsum("ni,nij,nj->n", updates, information, updates)
-        return squared.quantile(QUANTILE) > chi_squared_quantile(QUANTILE, 6)
-
-    ones = torch.ones((), dtype=torch.float64)
-    return float(_bisected(ones, MOST_CORRELATED * ones, are_larger))
+def _most_probable(prior: tuple[float, float], log_likelihood: Callable[[float], float]) -> float:
+    """Return the most probable value of a positive number whose logarithm has a normal ``prior`` (median, standard deviation)."""
+    median, width = prior
+    steps = torch.linspace(-4.0, 4.0, 161, dtype=torch.float64).tolist()
+    return max(
+        (-0.5 * x * x + log_likelihood(median * math.exp(width * x)), median * math.exp(width * x)) for x in steps
+    )[1]
 
 
-def _bisected(
-    low: Float[Tensor, "*n"], high: Float[Tensor, "*n"], is_above: Callable[[Tensor], Tensor]
-) -> Float[Tensor, "*n"]:
-    """Return the point between ``low`` and ``high`` at which ``is_above`` becomes false, found by geometric bisection."""
-    for _ in range(30):
-        middle = (low * high).sqrt()
-        above = is_above(middle)
-        low, high = torch.where(above, middle, low), torch.where(above, high, middle)
-    return (low * high).sqrt()
+def _student(errors: Float[Tensor, "n d"], covariances: Float[Tensor, "n d d"]) -> float:
+    """Return the log likelihood of errors with a multivariate Student-t distribution, up to a constant."""
+    factor = torch.linalg.cholesky(covariances)
+    squared = torch.linalg.solve_triangular(factor, errors[..., None], upper=False).square().sum((1, 2))
+    log = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    return -float((log + (FREEDOM + errors.shape[1]) / 2 * (squared / FREEDOM).log1p()).sum())
+
+
+def predicted_covariances(
+    answers: Sequence[LandmarkAnswer], matches: Sequence[int], landmarks: LandmarkMap
+) -> Float[Tensor, "n 6 6"]:
+    """Return the covariances of the answers as ``landmarks`` predict them."""
+    fits = torch.stack([answer.covariance / HEAVY_TAILS for answer in answers])
+    return _factors(matches, landmarks)[:, None, None] * fits + landmarks.pose_covariance
 
 
 def _factors(matches: Sequence[int], landmarks: LandmarkMap) -> Float[Tensor, "n"]:
-    """Return the factors that correct the covariances of answers for treating keypoints as independent."""
-    return torch.tensor([landmarks.correlation_of(count) for count in matches], dtype=torch.float64)
+    """Return the factors that correct the covariances of answers for the number of keypoints that count as one."""
+    counts = [landmarks.correlation_of(count) / KEYPOINTS_PER_INDEPENDENT for count in matches]
+    return torch.tensor(counts, dtype=torch.float64)
 
 
 def _calibration_scatter(answers: Sequence[LandmarkAnswer], factors: Float[Tensor, "n"]) -> Float[Tensor, "4"]:
@@ -154,10 +237,9 @@ def _calibration_scatter(answers: Sequence[LandmarkAnswer], factors: Float[Tenso
     widest = [found.posterior.camera_of(found.explanations.widest) for found in answers]
     apparent, noise = (torch.stack([camera[part][:4] for camera in widest]) for part in (0, 1))
     explained = factors[:, None] * noise.square()
-    limit = chi_squared_quantile(QUANTILE, 1)
 
-    def are_larger(scatter: Tensor) -> Tensor:
-        return (apparent.square() / (explained + scatter.square())).quantile(QUANTILE, dim=0) > limit
+    def scatter(number: int) -> float:
+        own, known = apparent[:, number, None], explained[:, number]
+        return _most_probable(SCATTER, lambda s: _student(own, (known + s * s)[:, None, None]))
 
-    ones = torch.ones(4, dtype=torch.float64)
-    return _bisected(1e-5 * ones, ones, are_larger)
+    return torch.tensor([scatter(number) for number in range(4)], dtype=torch.float64)

@@ -53,6 +53,8 @@ class Evidence:
     searched: bool  # whether the pose was found by landmarks, not only confirmed by them
     on_surface: float | None = None  # fraction of the measured points on the surface
     colour_inliers: float | None = None  # fraction of the measured points on the surface and with its colour
+    # difference between a small image and its rendering, relative to the usual one of the map's own images; None if not rendered
+    difference: float | None = None
 
     @property
     def above_chance(self) -> float:
@@ -68,6 +70,7 @@ class Bound(NamedTuple):
     is_least: bool
     outcome: Outcome
     reason: str  # with the value as ``{0}``, and the limit as ``{1}``
+    is_open: bool = False  # whether rendered rays may change the measure
 
     def keeps(self, value: float) -> bool:
         """Return whether a value satisfies the limit; NaN never does."""
@@ -79,7 +82,7 @@ LANDMARK_BOUNDS = (
     Bound("inliers", 15, True, Outcome.TOO_FEW_MATCHES, "only {0:.0f} landmark inliers"),
     Bound("above_chance", 3.0, True, Outcome.AMBIGUOUS, "only {0:.1f} times as many landmarks match as by chance"),
     Bound("spread", 0.06, True, Outcome.UNDETERMINED, "the landmarks are all in {0:.0%} of the image"),
-    Bound("other_place", 0.02, False, Outcome.AMBIGUOUS, "another place fits with a probability of {0:.0%}"),
+    Bound("other_place", 0.02, False, Outcome.AMBIGUOUS, "another place fits with a probability of {0:.0%}", True),
     Bound(
         "credible",
         0.5,
@@ -87,8 +90,17 @@ LANDMARK_BOUNDS = (
         Outcome.MISCALIBRATED,
         "the image contradicts the intrinsics: they are right with {0:.0%}",
     ),
-    Bound("precision", 0.03, False, Outcome.IMPRECISE, "the position is uncertain by {0:.1%} of the distance"),
-    Bound("mass", 0.8, True, Outcome.UNCERTAIN, "the pose is within the tolerance with a probability of {0:.0%}"),
+    Bound("precision", 0.03, False, Outcome.IMPRECISE, "the position is uncertain by {0:.1%} of the distance", True),
+    # At right poses on record the ratio was at most 2.6; at poses off by a few per cent of the distance, or with a wrong lens, more.
+    Bound(
+        "difference",
+        3.0,
+        False,
+        Outcome.RENDERING_MISMATCH,
+        "the image differs {0:.1f} times as much from its rendering as the map's own images",
+        True,
+    ),
+    Bound("mass", 0.8, True, Outcome.UNCERTAIN, "the pose is within the tolerance with a probability of {0:.0%}", True),
 )
 """Bounds on the evidence for a landmark-based pose, most serious first. The first bound does not apply to a pose found by other means."""
 
@@ -101,7 +113,7 @@ def judge(evidence: Evidence, log_odds: float = 0.0) -> Verdict:
     confidence = model().probability(features(evidence), log_odds)
     for bound in LANDMARK_BOUNDS if evidence.searched else LANDMARK_BOUNDS[1:]:
         value = getattr(evidence, bound.measure)
-        if not bound.keeps(value):
+        if value is not None and not bound.keeps(value):
             shown = 10.0 ** min(max(value, -300), 300) if bound.measure == "log10_nfa" else value
             return Verdict(bound.outcome, bound.reason.format(shown), confidence)
     share = f"{evidence.inliers} landmark inliers"

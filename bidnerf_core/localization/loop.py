@@ -20,7 +20,7 @@ from bidnerf_core.devices import run_on
 from bidnerf_core.fields import has_field
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.accept import LANDMARK_BOUNDS, Evidence, judge
+from bidnerf_core.localization.accept import LANDMARK_BOUNDS, Evidence, judge, same_pose
 from bidnerf_core.localization.explanations import MOVING, USUAL, Explanations, Proposal, explanations
 from bidnerf_core.localization.matching import (
     CELLS,
@@ -37,6 +37,7 @@ from bidnerf_core.localization.posterior import (
     Minima,
     Posterior,
     agreement,
+    cost_of,
     fit,
     fit_noise,
     fit_with_rays,
@@ -49,9 +50,11 @@ from bidnerf_core.localization.posterior import (
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.propose import CONVINCING, LEAST_AGREEING, best_consensus, consensus, inliers
 from bidnerf_core.localization.result import Outcome, Verdict, current_record
+from bidnerf_core.localization.terms.images import Images, refine_on_small_images, small_images
 from bidnerf_core.localization.terms.rays import RenderedRays
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.mapping import (
+    CAMERA,
     CostTerm,
     Features,
     LandmarkMap,
@@ -106,6 +109,13 @@ class LandmarkAnswer:
     @property
     def mode(self) -> Mode:
         return self.modes[self.posterior.mode]
+
+    @property
+    def is_open(self) -> bool:
+        """Whether rendered rays may change the verdict: only they can, and the camera, which they do not determine, is known."""
+        bounds = (bound for bound in LANDMARK_BOUNDS if not bound.is_open)
+        kept = all(bound.keeps(getattr(self.evidence, bound.measure)) for bound in bounds)
+        return kept and bool(self.explanations.usual[int(self.posterior.states.row[self.posterior.best])])
 
     @property
     def explanation(self) -> str:
@@ -351,7 +361,7 @@ class Loop:
     def _fused(
         self, modes: list[Mode], best: States, landmarks: Landmarks, given: Explanations, searched: bool
     ) -> LandmarkAnswer:
-        """Fuse all measurements under all explanations, and judge the result."""
+        """Fuse all measurements under all explanations, and judge the result; rays are rendered only where they can change it."""
         problem, terms = self.problem, list[CostTerm]([landmarks])
         # Up to three fits, until the explanation that a mode is linearized about is its most probable one.
         for _ in range(3):
@@ -368,44 +378,48 @@ class Loop:
             points = Surface.of(problem.views, problem.depth_rays, problem.surface, self.seed, device=where)
         if points is not None:
             noise, near, _ = run_on(self.device, fit_noise, points, found.chosen)
+            independent = points.independent / self.landmarks.trial.points
             # If less than a tenth of the points lies on the surface, depth is in another unit or of another scene, and is left
             # out. No pose on record with fewer was right, nor would any have been accepted without depth.
-            points = replace(points, noise=noise) if float(near) >= 0.1 else None
-        # At another place, or in a mirror image, only landmarks are used.
-        if points is not None and found.mode == 0:
+            points = replace(points, noise=noise, independent=independent) if float(near) >= 0.1 else None
+        if points is not None:
             terms.append(points)
             fused.append("depth")
-        if len(terms) > 1:
             best, minima = run_on(self.device, fit, best, terms, given, 5)
-            found = self._posterior(minima, landmarks)
-        before = found  # rays about one camera's pose must not decide between cameras
-        # Rays are worth rendering if landmarks alone leave the projection of the scene uncertain by more than 0.6 pixels.
-        position = float(found.mixture()[:3, :3].trace().sqrt().nan_to_num(math.inf))
-        blurred = float(landmarks.focal.max()) * position / landmarks.distance(found.chosen) > 0.6
-        # Rays move a pose that was found by chance too little to make enough matches agree.
-        by_chance = searched and self._log10_nfa(modes[0], found.chosen) > LANDMARK_BOUNDS[0].limit
-        if problem is not None and self.rays and found.mode == 0 and blurred and not by_chance:
-            where = "cpu" if problem.device == self.device else None
-            rays = RenderedRays.of(problem.views, problem.field, problem.bounds, self.rays, self.seed, device=where)
-            fused.append("rendering")
-            best = States.cat([found.chosen, best[1:]])
-            minima, by_rays = run_on(self.device, fit_with_rays, best, terms, rays, given)
-            systematic = torch.zeros_like(minima[0].hessian)
-            # The variance of the rays' gradients is ten times that due to their noise: neighbouring rays share the field's errors.
-            systematic[:1] = 9 * by_rays.hessian
-            found = self._posterior(minima, landmarks, systematic)
-        if points is not None:
+            found = self._posterior(minima, landmarks, -run_on(self.device, cost_of, points, best))
             near, both = run_on(self.device, agreement, points, found.chosen)
             others |= {"on_surface": float(near), "colour_inliers": float(both)}
-        mass = min(
-            each.mass(
-                landmarks.distance(each.chosen),
-                self.landmarks.pose_covariance,
-                given.credible[each.states.row],
-            )
-            for each in (found, before)
-        )
-        answer = self._judged(found, mass, modes, landmarks, given, searched, others)
+        answer = self._judged(found, modes, landmarks, given, searched, others)
+        # The uncertainty of the projection of the scene, in pixels; rays are worth rendering above 0.6.
+        blur = float(landmarks.focal.max()) * answer.evidence.precision / math.sqrt(HEAVY_TAILS)
+        # Also rendered: places and mirror images that are not much less probable; a mirror image at low resolution alone.
+        odds = [float(found.probability[found.states.mode == g].sum()) for g in range(len(modes))]
+        places = [g for g in sorted(range(len(modes)), key=lambda g: -odds[g]) if odds[g] > 1e-3]
+        which = torch.tensor([g for g in places if modes[g].name != MIRROR])
+        if problem is not None and self.rays and blur > 0.6 and answer.is_open and len(which):
+            # Small images are those of a camera at rest.
+            small = [] if answer.explanation.endswith(MOVING) else places
+            for g in small:
+                here = refine_on_small_images(problem, best[g : g + 1], blur, modes[g].name == MIRROR)
+                best = best.with_rows(torch.tensor([g]), here)
+            where = "cpu" if problem.device == self.device else None
+            rays = RenderedRays.of(problem.views, problem.field, problem.bounds, self.rays, self.seed, device=where)
+            minima, by_rays = run_on(self.device, fit_with_rays, best, terms, rays, given, which)
+            difference = torch.full((len(modes),), torch.nan, dtype=torch.float64)
+            for g in small:
+                there = minima[0].here[g : g + 1]
+                images = small_images(problem, 64, there.nuisances[0, CAMERA], modes[g].name == MIRROR)
+                difference[g] = images(there).cost[0] / Images.INDEPENDENT
+            # Neighbouring rays share the field's errors, which the scatter of the rays' gradients does not show.
+            systematic = (self.landmarks.trial.rays - 1) * by_rays
+            # Rays about one camera's pose must not decide between cameras, but may decide between places.
+            # A place that was not rendered counts as if the map showed it as well as any other.
+            log_odds = -Images.INDEPENDENT * difference.nan_to_num(float(difference.nan_to_num(1.0).amin()))
+            found = self._posterior(minima, landmarks, log_odds, systematic, found.log)
+            if small and self.landmarks.trial.difference > 0:
+                others["difference"] = float(difference[found.mode]) / self.landmarks.trial.difference
+            answer = self._judged(found, modes, landmarks, given, searched, others)
+            fused.append("rendering")
         return replace(answer, fused=tuple(fused))
 
     def _log10_nfa(self, mode: Mode, state: States) -> float:
@@ -413,22 +427,30 @@ class Loop:
         agreeing = int(inliers(mode.query, self.landmarks, mode.by_descriptors, state).sum())
         return log10_nfa(len(mode.by_descriptors), agreeing, mode.query.by_chance)
 
-    def _posterior(self, minima: Minima, landmarks: Landmarks, systematic: Tensor | float = 0.0) -> Posterior:
+    def _posterior(
+        self,
+        minima: Minima,
+        landmarks: Landmarks,
+        log_odds: Float[Tensor, "g"] | float = 0.0,
+        systematic: Tensor | float = 0.0,
+        log_weights: Float[Tensor, "h"] | None = None,
+    ) -> Posterior:
+        """Return the posterior over the explanations; ``log_odds`` between the modes come from measurements other than landmarks."""
         quadratic, states, normal = minima
-        log_odds = torch.zeros(len(quadratic.here), dtype=torch.float64)
         if self.problem is not None and (start := self.problem.start) is not None:
             # Of two places that look the same, the one nearer to the start is likelier.
             update = (start.inverse() @ quadratic.here.T).log()
             away = update[:, :3].norm(dim=-1) + self._distance(start) * update[:, 3:].norm(dim=-1)
             # In six dimensions, the density of a normal distribution of unknown width falls with the sixth power of the distance.
-            log_odds = -6.0 * away.clamp(min=1e-9).log()
+            log_odds = log_odds - 6.0 * away.clamp(min=1e-9).log()
         scatter = self.landmarks.calibration_scatter.double()
-        return Posterior.of(states, normal, quadratic, landmarks, scatter, systematic, log_odds, self.device)
+        return Posterior.of(
+            states, normal, quadratic, landmarks, scatter, systematic, log_odds, log_weights, self.device
+        )
 
     def _judged(
         self,
         found: Posterior,
-        mass: float,
         modes: list[Mode],
         term: Landmarks,
         given: Explanations,
@@ -448,6 +470,11 @@ class Loop:
         covariance = HEAVY_TAILS * (found.mixture() + self.landmarks.pose_covariance)
         position = float(covariance[:3, :3].trace().sqrt().nan_to_num(math.inf, math.inf))
         row = found.states.row
+        # Modes that were refined to the same pose are one place; a mirror image is another one even there.
+        middle = torch.tensor([0.0, 0.0, distance], dtype=torch.float64)
+        places = SE3.stack([found.place(g) for g in range(len(modes))])
+        same = same_pose(state.T[0], places, middle) & torch.tensor([mode.name != MIRROR for mode in modes])
+        same = (found.states.mode == found.mode) | same[found.states.mode]
         evidence = Evidence(
             log10_nfa=self._log10_nfa(mode, state) if searched else 0.0,
             inliers=count,
@@ -455,11 +482,11 @@ class Loop:
             recall=count / max(1, min(seen.visible, len(query.view))),
             spread=len(occupied.unique()) / CELLS**2 / len(query.images),
             noise_ratio=float(state.noise) / self.landmarks.noise,
-            other_place=float(found.probability[found.states.mode != found.mode].sum()),
+            other_place=float(found.probability[~same].sum()),
             credible=float(found.probability[given.credible[row]].sum()),
             replaced=float(found.probability[~given.usual[row]].sum()),
             precision=min(position / distance, 1.0),
-            mass=mass,
+            mass=found.mass(distance, self.landmarks.pose_covariance, given.credible[row]),
             searched=searched,
             **others,
         )

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bidnerf_core.devices import run_on
@@ -46,6 +46,7 @@ class Posterior:
     probability: Float[Tensor, "h"]
     covariance: Float[Tensor, "h 6 6"]  # of the pose under each explanation
     update: Float[Tensor, "h 6"]  # from the pose of the most probable explanation
+    log: Float[Tensor, "h"]  # logarithm of the unnormalized probability among the explanations of the same mode
     best: int
 
     @staticmethod
@@ -57,27 +58,28 @@ class Posterior:
         scatter: Float[Tensor, "4"],
         systematic: Float[Tensor, "g P P"] | float = 0.0,
         log_odds: Float[Tensor, "g"] | float = 0.0,
+        log_weights: Float[Tensor, "h"] | None = None,
         device: torch.device = torch.device("cpu"),  # noqa: B008
     ) -> Posterior:
         """Compare explanations within a mode by their cost, and modes by the evidence of landmarks and their prior ``log_odds``.
 
         ``terms`` are the quadratic models of all terms, and ``states`` and ``normal`` their minima under each explanation. ``systematic``
-        is the scatter of the models' gradients (in the units of ``terms``) beyond that of independent errors. Most of the computation runs
-        on ``device``.
+        is the scatter of the models' gradients (in the units of ``terms``) beyond that of independent errors. ``log_weights`` replace the
+        evidence for explanations of a mode, if given. Most of the computation runs on ``device``.
         """
         by_mode, information = run_on(device, _information, states, normal, terms, landmarks, systematic)
-        log = log_evidence(states, normal)
+        weights = log_evidence(states, normal) if log_weights is None else log_weights
         member = states.mode[None] == torch.arange(len(terms.here))[:, None]
-        norm = torch.where(member, log[None], -torch.inf).logsumexp(-1)
+        norm = torch.where(member, weights[None], -torch.inf).logsumexp(-1)
         # The log odds between places do not grow in proportion to the number of matches, since the right place rarely has fewer than
         # two thirds as many as another: a factor of e in the evidence adds ten. Below an evidence of 50, places are not compared, since
         # a few chance matches are no evidence against even fewer.
-        log = log + (log_odds + 10.0 * by_mode.clamp(min=50.0).log() - norm)[states.mode]
+        log = weights + (log_odds + 10.0 * by_mode.clamp(min=50.0).log() - norm)[states.mode]
         probability = log.nan_to_num(-torch.inf).softmax(0)
         best = int(probability.argmax())
         states, covariance = _true_cameras(states, normal, _robust_covariance(*information), scatter)
         anchor = states.T[best]
-        return Posterior(states, normal, probability, covariance, (anchor.inverse() @ states.T).log(), best)
+        return Posterior(states, normal, probability, covariance, (anchor.inverse() @ states.T).log(), weights, best)
 
     @property
     def mode(self) -> int:
@@ -273,18 +275,24 @@ def settle(best: States, term: Landmarks, given: Explanations) -> tuple[States, 
 
 
 def fit_with_rays(
-    best: States, terms: Sequence[CostTerm], rays: RenderedRays, given: Explanations
-) -> tuple[Minima, Quadratic]:
-    """Refine the first state with rays; return the minima, and the quadratic model of the rays about this state alone.
+    best: States, terms: Sequence[CostTerm], rays: RenderedRays, given: Explanations, which: Int[Tensor, "r"]
+) -> tuple[Minima, Float[Tensor, "g P P"]]:
+    """Refine the states ``which`` with rays; return the minima, and the Hessians of the rays alone, 0 for the other states.
 
-    Rays are too expensive to be rendered for all hypotheses.
+    Rays are too expensive to be rendered for all explanations.
     """
-    rays = rays.fitted(best)
-    here, _ = descend(best[:1], [*terms, rays], 8)
-    quadratic = linearize(States.cat([here, best[1:]]), terms, given)
-    by_rays = Quadratic.of(rays(quadratic.here[:1]), quadratic.here[:1])
-    quadratic = quadratic.with_first(by_rays)
-    return (quadratic, *quadratic.minimum(given.about(quadratic.here))), by_rays
+    rays = rays.fitted(best[which])
+    here, _ = descend(best[which], [*terms, rays], 4)
+    quadratic = linearize(best.with_rows(which, here), terms, given)
+    by_rays = Quadratic.of(rays(quadratic.here[which]), quadratic.here[which])
+    quadratic = quadratic.with_rows_added(which, by_rays)
+    hessian = torch.zeros_like(quadratic.hessian).index_add(0, which, by_rays.hessian)
+    return (quadratic, *quadratic.minimum(given.about(quadratic.here))), hessian
+
+
+def cost_of(points: Surface, states: States) -> Float[Tensor, "h"]:
+    """Return the cost of the points, a negative log likelihood, at each state."""
+    return points(states).cost
 
 
 def agreement(points: Surface, state: States) -> tuple[Tensor, Tensor]:

@@ -46,7 +46,7 @@ LANDMARK_KINDS = {
     "correlation": TensorKind("", torch.float64, least=TINY),
     "usual_matches": TensorKind("", torch.float64, least=0),
     "calibration_scatter": TensorKind("4", torch.float64, least=TINY),
-    "trial": TensorKind("4", torch.float64),  # the fields of ``HeldOutTrial`` in order
+    "trial": TensorKind("t", torch.float64),  # the fields of ``HeldOutTrial`` in order; earlier versions stored fewer
     "moving": TensorKind("", torch.float64, least=0, most=1),
 }
 TRACK_KINDS = {
@@ -117,8 +117,8 @@ def landmarks_from_tensors(tensors: dict[str, Tensor]) -> LandmarkMap:
         raise ValueError("pose_covariance is not symmetric and positive semidefinite")
     parts: dict[str, Any] = {name: tensors[name] for name in LANDMARK_KINDS}
     parts |= {name: float(tensors[name]) for name in ("noise", "correlation", "usual_matches", "moving")}
-    images, localized, translation, rotation_deg = tensors["trial"].tolist()
-    parts["trial"] = HeldOutTrial(int(images), int(localized), translation, rotation_deg)
+    images, localized, *errors = tensors["trial"].tolist()
+    parts["trial"] = HeldOutTrial(int(images), int(localized), *errors)
     if tracks:
         parts["tracks"] = Tracks(*(tensors[name] for name in tracks))
     return LandmarkMap(**parts)

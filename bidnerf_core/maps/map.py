@@ -21,6 +21,7 @@ from bidnerf_core.captures import (
     stored_cameras,
     summary,
     survey_capture,
+    tried_field,
     tried_landmarks,
     up_direction,
     up_from_gravity,
@@ -382,11 +383,14 @@ class Map:
         noise = colour_noise(self.field, self.bounds, views) if self.has_field else None
         scene = replace(self, info=replace(self.info, colour_noise=noise))
         counter("surveying the photos", "stage")(0, 1)
-        trial = HeldOutTrial() if self.landmarks is None else self.landmarks.trial
+        landmarks = self.landmarks
+        if landmarks is not None:
+            landmarks = replace(landmarks, trial=tried_field(scene, views, landmarks.trial))
+        trial = HeldOutTrial() if landmarks is None else landmarks.trial
         capture = survey_capture(tracked, views, trial=trial, up=self.up)
         for line in summary(capture):
             log.info(line)
-        return scene.with_parts(None, None, capture)
+        return scene.with_parts(None, landmarks, capture)
 
     def with_parts(
         self,

@@ -129,7 +129,7 @@ def test_the_evidence_of_a_gaussian_model_is_the_marginal_density_of_its_observa
 
 def test_the_sum_of_models_about_a_mode_is_the_model_of_the_sum() -> None:
     (A, b, one), (C, d, other) = model(), model(seed=5)
-    joined = one.with_first(other)
+    joined = one.with_rows_added(torch.tensor([0]), other)
     both = least_squares(torch.cat([A, C]), torch.cat([b, d]))
     here = Quadratic.of(both(one.here), one.here)
     for name in ("cost", "gradient", "hessian"):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -15,12 +16,13 @@ from torch import Tensor
 from torch.nn.functional import conv2d, grid_sample, interpolate, normalize, pad
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.devices import constant
+from bidnerf_core.devices import constant, move_to
 from bidnerf_core.fields import RadianceField, SceneBounds, render
 from bidnerf_core.frames import View, inpaint
 from bidnerf_core.geometry import SE3, inlier_weight
+from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.terms.exposure import fit_exposure
-from bidnerf_core.mapping import Normal, P, States, SurfaceMap, cast
+from bidnerf_core.mapping import CAMERA, Normal, P, States, SurfaceMap, cast, descend, true_intrinsics
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +49,13 @@ class Thumbnail:
             rgb = grid_sample(rgb, seen[None], padding_mode="border", align_corners=False)
         rgb, T = smooth(rgb[0]), view.T_ref_camera.to("cpu", torch.float64)
         return Thumbnail(small, T, rgb, flat.reshape(-1, 3), slopes(rgb, small))
+
+    @property
+    def mirrored(self) -> Thumbnail:
+        """The mirror image, left and right swapped."""
+        camera, rgb = replace(self.camera, cx=self.camera.width - self.camera.cx), self.rgb.flip(-1)
+        flat = camera.unproject(camera.pixel_centres()).to(self.flat).reshape(-1, 3)
+        return Thumbnail(camera, self.T_last_camera, rgb, flat, slopes(rgb, camera))
 
 
 def smooth(image: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
@@ -120,15 +129,17 @@ class ColourScales:
 
 @dataclass(frozen=True, eq=False)
 class Images:
-    """Cost of small images: the mean over pixels of ``1 - 1 / (1 + c^2 / s^2)``, times 60.
+    """Cost of small images: the mean over pixels of ``1 - 1 / (1 + c^2 / s^2)``, times ``INDEPENDENT``.
 
-    Here, c is the difference between rendered and measured colour, s is ``ColourScales.colour``, and 60 is the number of independent
-    measurements in a small image.
+    Here, c is the difference between rendered and measured colour, and s is ``ColourScales.colour``.
 
     Colours are linearized with second-order accuracy, using the mean of both images' gradients (Benhimane and Malis 2004, "Real-time
     image-based tracking of planes using efficient second-order minimization"). Only the pose has derivatives. The cost is infinite for
     poses that are not finite. Everything is computed on the device of the thumbnails, which is also that of the renderer.
     """
+
+    INDEPENDENT: ClassVar[float] = 60.0
+    """Number of independent measurements in a small image."""
 
     renderer: Renderer
     thumbnails: Sequence[Thumbnail]
@@ -138,7 +149,7 @@ class Images:
     def __call__(self, states: States) -> Normal:
         parts = [self._of_thumbnail(small, states.T) for small in self.thumbnails]
         cost, gradient, hessian = (
-            60.0 * torch.stack(values).mean(0).to(states.z) for values in zip(*parts, strict=True)
+            self.INDEPENDENT * torch.stack(values).mean(0).to(states.z) for values in zip(*parts, strict=True)
         )
         sound = states.T.translation.isfinite().all(-1) & states.T.rotation.isfinite().all(-1).all(-1)
         extra = P - 6
@@ -202,3 +213,33 @@ def render_view(renderer: Renderer, small: Thumbnail, T: SE3) -> tuple[Tensor, T
     rgb, along = rgb / known.clamp(min=1e-3), along.view(count, -1)
     points = origin + along[..., None] * local
     return rgb.flatten(2), known.flatten(1), points, along / torch.linalg.vector_norm(small.flat, dim=-1)
+
+
+def small_images(
+    problem: Problem, width: int, camera: Float[Tensor, "6"] | None = None, mirrored: bool = False
+) -> Images:
+    """Return the term that compares images of at most ``width`` pixels, or their mirror images, with renderings of the field.
+
+    ``camera`` is the correction of the stated camera (see ``NUISANCES``), if there is one.
+    """
+    views = problem.views
+    if camera is not None and not mirrored:
+        changed = (v.frame.replace(intrinsics=true_intrinsics(v.frame.intrinsics, camera)) for v in views)
+        views = tuple(replace(view, frame=frame) for view, frame in zip(views, changed, strict=True))
+    thumbnails = [Thumbnail.of(view, width) for view in views]
+    thumbnails = [move_to(each.mirrored if mirrored else each, problem.device) for each in thumbnails]
+    return Images(field_renderer(problem.field, problem.bounds), thumbnails)
+
+
+def refine_on_small_images(problem: Problem, state: States, blur: float, mirrored: bool = False) -> States:
+    """Refine a state on small renderings of the field, from coarse to fine, if it is off by more than rays can mend.
+
+    ``blur`` is the uncertainty of the projection of the scene, pixels. Widths are such that it is about one pixel at first. The
+    camera is held.
+    """
+    frames = [view.frame.intrinsics for view in problem.views]
+    width = max(32.0, max(max(camera.width, camera.height) for camera in frames) / blur)
+    while width <= 128:
+        state, _ = descend(state, [small_images(problem, round(width), state.nuisances[0, CAMERA], mirrored)], 5)
+        width *= 2
+    return state

@@ -35,6 +35,11 @@ class HeldOutTrial:
     found: int = 0  # number of these images whose pose was found
     translation: float = 0.0  # metres: median error
     rotation_deg: float = 0.0
+    # Factors by which the information of points on the surface and of rendered rays exceeds that of independent measurements.
+    # They are unknown for points in a map without measured depth, whose surface has the errors of the field's depth.
+    points: float = 10.0
+    rays: float = 3.0
+    difference: float = 0.0  # usual difference between a small image and its rendering, see ``Images``; 0 if unknown
 
     def scaled(self, factor: float) -> HeldOutTrial:
         """Return the trial in a map with lengths multiplied by ``factor``."""

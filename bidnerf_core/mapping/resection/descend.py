@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -115,11 +115,10 @@ class Quadratic:
         cost = self.cost[g] + 0.5 * ((pull + self.gradient[g]) * off).sum(-1)
         return Normal(cost, pull * scale, scale[:, :, None] * self.hessian[g] * scale[:, None])
 
-    def with_first(self, other: Quadratic) -> Quadratic:
-        """Return the models with ``other``, a model of further terms about the first mode's state, added to the first one."""
-        names = ("cost", "gradient", "hessian")
-        joined = ((getattr(self, name), getattr(other, name)) for name in names)
-        return Quadratic(self.here, *(torch.cat([own[:1] + more, own[1:]]) for own, more in joined))
+    def with_rows_added(self, which: Int[Tensor, "r"], other: Quadratic) -> Quadratic:
+        """Return the models with ``other``, models of further terms about the states ``which``, added to theirs."""
+        parts = ((getattr(self, name), getattr(other, name)) for name in ("cost", "gradient", "hessian"))
+        return Quadratic(self.here, *(own.index_add(0, which, more) for own, more in parts))
 
     def minimum(self, states: States) -> tuple[States, Normal]:
         """Minimize the sum of the models and the prior from each state; the second step accounts for the curvature of rotations."""

@@ -68,7 +68,7 @@ class Landmarks:
             for x in (scatter, curvature)
         ]
         excess = traces[0].mean(-1) / traces[1].mean(-1).clamp(min=0.1)
-        count = 2 * self.valid[states.mode].sum(-1) * independent
+        count = 2 * self.valid[states.mode].sum(-1)
         known = (count / (36 + count))[:, None, None]
         alike = (excess * count / (count - 6).clamp(min=1))[:, None, None] * curvature
         return hessian, curvature, known * scatter + (1 - known) * alike
@@ -129,7 +129,7 @@ class Landmarks:
         spare = (1 - 3 / count).clamp(min=0.1)  # six unknowns, two residuals of a match
         hessian = (valid * weight).sum(-1) / count
         efficiency = spare * curvature.clamp(min=0.1).square() / (scatter * hessian).clamp(min=1e-3)
-        return replace(self, share=efficiency / self.correlation)
+        return replace(self, share=efficiency * self.share)
 
     def distance(self, states: States) -> float:
         """Return the median distance of the matched points from the first state's pose, metres."""

@@ -91,6 +91,12 @@ class States:
         t = torch.where(mask[:, None], self.T.translation, other.T.translation)
         return replace(self, T=SE3(R, t), z=torch.where(mask[:, None], self.z, other.z))
 
+    def with_rows(self, which: Int[Tensor, "r"], other: States) -> States:
+        """Return these states with ``other`` in the place of the states ``which``."""
+        index = torch.arange(len(self), device=which.device)
+        index[which] = len(self) + torch.arange(len(which), device=which.device)
+        return States.cat([self, other])[index]
+
     def under(self, mean: Float[Tensor, "N"], deviation: Float[Tensor, "N"]) -> States:
         """Return the same poses and nuisances with another prior; a nuisance that the prior fixes takes the prior's mean."""
         free = deviation > 0
