@@ -81,7 +81,8 @@ def tried_landmarks(
     trial = HeldOutTrial(wanted, len(answers), float(translation), float(rotation.rad2deg()))
     landmarks = replace(landmarks, trial=trial)
     matches = [len(answer.mode.matches) for answer in answers]
-    landmarks = replace(landmarks, usual_matches=float(torch.tensor(matches).float().median()))
+    if len(answers) >= 6:  # fewer do not show what is usual
+        landmarks = replace(landmarks, usual_matches=float(torch.tensor(matches).float().median()))
 
     correlation = _most_probable(
         CORRELATION,
