@@ -42,9 +42,9 @@ from bidnerf.cli import display_progress
 from bidnerf.evaluation import (
     NEVER,
     PROTOCOLS,
-    Group,
     Plan,
     Protocol,
+    ResultGroup,
     ResultsFile,
     Size,
     Trial,
@@ -257,7 +257,7 @@ def trials_of(plan: Plan, scene: Scene) -> list[Trial]:
     return list_trials(plan, *scene, open_scene(*scene, plan)[1])
 
 
-def run_part(trials: Sequence[Trial], path: Path, workers: int, minutes: float | None = None) -> list[Group]:
+def run_part(trials: Sequence[Trial], path: Path, workers: int, minutes: float | None = None) -> list[ResultGroup]:
     """Run the missing trials and return the groups of all results; after ``minutes``, of those available by then.
 
     Raises ``SystemExit`` if it is stopped, or if nothing was done in time.
@@ -292,14 +292,14 @@ class PairTest:
     all_p: float  # of equal speed over all trials, where a failure is slower than any success
 
 
-def pairwise_tests(groups: Sequence[Group], criterion: str) -> list[PairTest]:
+def pairwise_tests(groups: Sequence[ResultGroup], criterion: str) -> list[PairTest]:
     """Return the tests of every pair of groups that share a situation and to which the criterion applies."""
     fitting = [group for group in groups if group.summary.success[criterion] is not None]
     pairs = itertools.combinations(fitting, 2)
     return [compare_pair(a, b, criterion) for a, b in pairs if a.situation == b.situation]
 
 
-def compare_pair(first: Group, second: Group, criterion: str) -> PairTest:
+def compare_pair(first: ResultGroup, second: ResultGroup, criterion: str) -> PairTest:
     """Test whether two groups differ in success rate or in steps to success, by one criterion."""
     a, b = (steps_of(group.results, criterion) for group in (first, second))
     good_a, good_b = ([s for s in row if s < NEVER] for row in (a, b))
@@ -323,7 +323,7 @@ def compare_pair(first: Group, second: Group, criterion: str) -> PairTest:
     )
 
 
-def as_record(groups: Sequence[Group]) -> dict[str, Any]:
+def as_record(groups: Sequence[ResultGroup]) -> dict[str, Any]:
     """Return rates by each criterion, costs, and p values of each pair, for each size and over all sizes."""
     cells = [
         {

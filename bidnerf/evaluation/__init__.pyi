@@ -35,7 +35,7 @@ from .run import local_processes as local_processes
 from .run import missing_trials as missing_trials
 from .run import run_trials as run_trials
 from .summary import NEVER as NEVER
-from .summary import Group as Group
+from .summary import ResultGroup as ResultGroup
 from .summary import Summary as Summary
 from .summary import group_results as group_results
 from .summary import median as median

@@ -20,14 +20,14 @@ from bidnerf.evaluation.comparison import Comparison
 from bidnerf.evaluation.faults import NO_FAULT
 from bidnerf.evaluation.summary import (
     NEVER,
-    Group,
+    ResultGroup,
     Situation,
     applies,
     are_stepwise,
     is_right,
     situations,
     steps_of,
-    unit_of,
+    unit_of_results,
 )
 from bidnerf.evaluation.trial import TrialResult
 from bidnerf.results import (
@@ -95,7 +95,7 @@ class Figures:
     situations.
     """
 
-    def __init__(self, groups: Sequence[Group], folder: Path, criterion: str) -> None:
+    def __init__(self, groups: Sequence[ResultGroup], folder: Path, criterion: str) -> None:
         require_matplotlib()
         self.folder, self.criterion = folder, criterion
         self.groups = [g for g in groups if g.situation.fault == NO_FAULT] or list(groups)
@@ -130,7 +130,7 @@ class Figures:
 
     # What a panel shows of the groups of a situation.
 
-    def _shares(self, axes: Any, groups: Sequence[Group], of: str) -> None:
+    def _shares(self, axes: Any, groups: Sequence[ResultGroup], of: str) -> None:
         """Draw the cumulative share of trials over the quantity ``of``."""
         label, share, bound, value = QUANTITIES[of]
         for group in groups:
@@ -141,7 +141,7 @@ class Figures:
             if reached:
                 shares = [100 * count / len(values) for count in range(len(reached) + 1)]
                 axes.step([reached[0], *reached], shares, where="post", **self.looks[group.label])
-        axes.set(xlabel=label.format(unit=unit_of(groups[0].results)), ylabel=share, ylim=(-2, 102))
+        axes.set(xlabel=label.format(unit=unit_of_results(groups[0].results)), ylabel=share, ylim=(-2, 102))
         if bound is not None:
             axes.axvline(bound, **BOUND)
         if of == "steps":
@@ -150,7 +150,7 @@ class Figures:
         else:
             _set_logarithmic(axes, "x")
 
-    def _quartiles(self, axes: Any, groups: Sequence[Group], kind: str) -> None:
+    def _quartiles(self, axes: Any, groups: Sequence[ResultGroup], kind: str) -> None:
         """Draw the median and the quartiles of an error after each step."""
         for group in groups:
             rows = [np.array(getattr(r.errors, kind), dtype=float) for r in group.results]
@@ -163,14 +163,14 @@ class Figures:
             axes.plot(middle, **look)
             axes.fill_between(range(longest), low, high, color=look["color"], alpha=0.14, linewidth=0)
         axes.axhline(QUANTITIES[kind].bound, **BOUND)
-        axes.set(xlabel="step", ylabel=QUANTITIES[kind].label.format(unit=unit_of(groups[0].results)))
+        axes.set(xlabel="step", ylabel=QUANTITIES[kind].label.format(unit=unit_of_results(groups[0].results)))
         axes.set_xlim(left=0)
         _set_logarithmic(axes, "y")
 
     # How panels become a figure.
 
     def _by_situation(
-        self, name: str, groups: Sequence[Group], draw: Sequence[Callable[..., None]], caption: str
+        self, name: str, groups: Sequence[ResultGroup], draw: Sequence[Callable[..., None]], caption: str
     ) -> Figure | None:
         """Draw a row of panels for each situation, one panel for each function in ``draw``."""
         panels, count = list[Panel](), len(situations(groups))
@@ -241,7 +241,7 @@ def comparison_figure(folder: Path, comparison: Comparison) -> Path:
     first = comparison.results[0][0].trial
     situation = Situation("", "", first.data, first.images.split, first.protocol, first.fault, first.size)
     pairs = zip(comparison.rows, comparison.results, strict=True)
-    groups = [Group(situation, "", row.map, results) for row, results in pairs]
+    groups = [ResultGroup(situation, "", row.map, results) for row, results in pairs]
     figures = Figures(groups, folder, "")
 
     def bars(axes: Any, values: Sequence[float]) -> None:

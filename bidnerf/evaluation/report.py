@@ -21,7 +21,7 @@ from bidnerf.evaluation.results import Provenance, ResultTable
 from bidnerf.evaluation.summary import (
     ABSOLUTE,
     RELATIVE,
-    Group,
+    ResultGroup,
     applies,
     are_stepwise,
     is_right,
@@ -75,7 +75,7 @@ def write_report(
     return path
 
 
-def choose_criterion(name: str | None, groups: Sequence[Group]) -> str:
+def choose_criterion(name: str | None, groups: Sequence[ResultGroup]) -> str:
     """Return the criterion to use where a report shows a single one: ``name``, or one that applies to all groups.
 
     Raises ``InputError`` for an unknown criterion, and for one that applies to no trial.

@@ -28,7 +28,7 @@ import torch
 
 import bidnerf_core
 from bidnerf.evaluation.plan import Trial
-from bidnerf.evaluation.summary import Group, group_results
+from bidnerf.evaluation.summary import ResultGroup, group_results
 from bidnerf.evaluation.trial import TrialResult, read_result
 from bidnerf.results import CRITERIA
 from bidnerf_core.errors import InputError, printable
@@ -61,7 +61,7 @@ class ResultTable:
     rows: tuple[TrialResult, ...]
 
     @cached_property
-    def groups(self) -> list[Group]:
+    def groups(self) -> list[ResultGroup]:
         """The results, grouped by situation (what was to be localized) and condition (what localized it)."""
         return group_results(self.rows)
 

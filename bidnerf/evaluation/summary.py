@@ -50,7 +50,7 @@ class Situation:
 
 
 @dataclass(frozen=True)
-class Group:
+class ResultGroup:
     """The trials of one condition (a method with its settings, input and hardware) in one situation."""
 
     situation: Situation
@@ -64,7 +64,7 @@ class Group:
         return summarize(self.results)
 
 
-def group_results(results: Sequence[TrialResult]) -> list[Group]:
+def group_results(results: Sequence[TrialResult]) -> list[ResultGroup]:
     """Group trial results by situation and condition, and add a pooled group for each condition tried at several sizes.
 
     Groups are sorted by map, data, protocol and fault in order of appearance, then by size, with the pooled sizes last.
@@ -85,10 +85,12 @@ def group_results(results: Sequence[TrialResult]) -> list[Group]:
         key=lambda key: (order[replace(key[0], size=None)], key[0].size is None, key[0].size or ()),
     )
     titles = situation_titles([situation for situation, _ in keys])
-    return [Group(situation, titles[situation], label, tuple(rows[situation, label])) for situation, label in keys]
+    return [
+        ResultGroup(situation, titles[situation], label, tuple(rows[situation, label])) for situation, label in keys
+    ]
 
 
-def situations(groups: Sequence[Group]) -> list[Situation]:
+def situations(groups: Sequence[ResultGroup]) -> list[Situation]:
     """Return the situations of ``groups``, each once, in order."""
     return list(dict.fromkeys(group.situation for group in groups))
 
@@ -188,8 +190,8 @@ def summarize(results: Sequence[TrialResult]) -> Summary:
     errors = [result.error for result in results]
     return Summary(
         trials=len(results),
-        frames=len({frame_of(result) for result in results}),
-        unit=unit_of(results),
+        frames=len({frame_label(result) for result in results}),
+        unit=unit_of_results(results),
         success={name: success_of(results, name) for name in CRITERIA},
         translation=median(e.translation if e else None for e in errors),
         rotation_deg=median(e.rotation_deg if e else None for e in errors),
@@ -203,12 +205,12 @@ def summarize(results: Sequence[TrialResult]) -> Summary:
     )
 
 
-def frame_of(result: TrialResult) -> tuple[str, str, tuple[str, ...]]:
+def frame_label(result: TrialResult) -> tuple[str, str, tuple[str, ...]]:
     """Return the identity of a trial's images: trials of the same images are not independent."""
     return result.trial.data, result.trial.images.split, result.trial.frames
 
 
-def unit_of(results: Sequence[TrialResult]) -> LengthUnit:
+def unit_of_results(results: Sequence[TrialResult]) -> LengthUnit:
     """Return the unit of the errors of trials: metres if all errors are in metres."""
     return "metres" if results and all(result.unit == "metres" for result in results) else "units"
 
@@ -244,7 +246,7 @@ def success_of(results: Sequence[TrialResult], criterion: str) -> Success | None
         return None
     steps = steps_of(results, criterion)
     # The interval accounts for frames that were tried several times.
-    rate = success_rate_by_frame([s < NEVER for s in steps], [frame_of(result) for result in results])
+    rate = success_rate_by_frame([s < NEVER for s in steps], [frame_label(result) for result in results])
     # The time of a method without steps is that of the whole answer.
     reached = [
         (s, 1000 * (s * r.seconds / r.steps if r.steps > 1 else r.seconds))

@@ -26,7 +26,7 @@ class Executor(Protocol):
 
 
 AnyExecutor = TypeVar("AnyExecutor", bound=Executor)
-Result = TypeVar("Result")
+Returned = TypeVar("Returned")
 
 
 class RequestQueue(Generic[AnyExecutor]):
@@ -81,11 +81,11 @@ class ThreadExecutor:
     def __init__(self, name: str) -> None:
         self._thread = ThreadPoolExecutor(1, name)
 
-    async def run(self, work: Callable[[], Result]) -> Result:
+    async def run(self, work: Callable[[], Returned]) -> Returned:
         """Return the result of ``work``, which is cancelled (see ``job_context``) if this call is cancelled."""
         cancelled = threading.Event()
 
-        def work_until_cancelled() -> Result:
+        def work_until_cancelled() -> Returned:
             with job_context(cancel=cancelled.is_set):
                 return work()
 

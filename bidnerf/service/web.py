@@ -62,7 +62,7 @@ ERRORS = {
     504: ("took too long", "The answer took too long."),
 }
 """Titles and descriptions of errors, by HTTP status."""
-Report = Callable[[Scope, int, float, Exception | None], None]
+FaultReport = Callable[[Scope, int, float, Exception | None], None]
 """A function that receives the scope, the status, the duration (seconds) and the internal error of each request."""
 
 
@@ -80,7 +80,7 @@ class Application(FastAPI):
         title: str,
         token: str | None,
         cookie: str | None = None,
-        report: Report = report_fault,
+        report: FaultReport = report_fault,
         **more: Any,
     ) -> None:
         self.refused, self.lifespan = 401 if token is not None else 403, more["lifespan"]
@@ -143,7 +143,7 @@ class Gate:
     cookie, a browser needs to send the token only once, in the address ``/?token=TOKEN``.
     """
 
-    def __init__(self, app: ASGIApp, token: str | None, cookie: str | None, report: Report) -> None:
+    def __init__(self, app: ASGIApp, token: str | None, cookie: str | None, report: FaultReport) -> None:
         self.app, self.token, self.cookie, self.report = app, token, cookie, report
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -41,7 +41,7 @@ from bidnerf.structure.record import (
     interrupted_work,
     is_output,
     open_work,
-    read_record,
+    read_pose_record,
     remove_output,
 )
 from bidnerf.structure.sources import (
@@ -95,7 +95,7 @@ def find_poses(
     inputs = digest([image.file for image in images] or [source], camera)
     if reuse or not overwrite:
         with contextlib.suppress(*([InputError] if overwrite else [])):  # a damaged record is replaced
-            record = read_record(folder)
+            record = read_pose_record(folder)
             if record is not None and record.inputs == inputs:
                 log.info(f"{folder}: already has the poses of these photos")
                 return record

@@ -96,7 +96,7 @@ def digest(files: Sequence[Path], camera: Intrinsics | str | Path | None) -> str
     return hashlib.blake2b(json.dumps([identities, settings]).encode(), digest_size=16).hexdigest()
 
 
-def read_record(folder: Path) -> FoundPoses | None:
+def read_pose_record(folder: Path) -> FoundPoses | None:
     """Load the record in a pose folder, or None if there is none. Raises ``InputError`` for a damaged one."""
     if not (folder / RECORD).is_file() or not (folder / TRANSFORMS).is_file():
         return None

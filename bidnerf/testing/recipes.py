@@ -106,7 +106,7 @@ def check_exposure(backend: Backend, config: Any) -> None:
         _train(backend, fields[-1], views, config, Recorder(), "on RGB views of different exposure")
     found = []
     for number, view in enumerate(exposed_views(0.0)):
-        bright, dark = (render_view(field, view, DIMMED_BOUNDS) for field in fields)
+        bright, dark = (render_training_view(field, view, DIMMED_BOUNDS) for field in fields)
         ratio = (bright * dark).sum() / dark.square().sum().clamp(min=1e-12)
         found.append((-1) ** number * math.log(max(float(ratio), 1e-6)) / (2 * EXPOSURE))
     share = sum(found) / len(found)
@@ -187,12 +187,12 @@ def check_resuming(backend: Backend, make: Callable[[], Any], config: Any, whole
 
 def colour_error(field: RadianceField) -> float:
     """Return the mean squared colour error over all pixels of the training views."""
-    found = [render_view(field, view, SCENE_BOUNDS) for view in rgbd_views()]
+    found = [render_training_view(field, view, SCENE_BOUNDS) for view in rgbd_views()]
     seen = torch.cat([view.frame.rgb.reshape(-1, 3) for view in rgbd_views()])
     return float((torch.cat(found) - seen).square().mean())
 
 
-def render_view(field: RadianceField, view: View, bounds: SceneBounds) -> Float[Tensor, "r 3"]:
+def render_training_view(field: RadianceField, view: View, bounds: SceneBounds) -> Float[Tensor, "r 3"]:
     """Return the field's colours at all pixels of a view."""
     with torch.no_grad(), calling(f"render by {type(field).__name__}"):
         return render(field, camera_rays(view.T_ref_camera.to(torch.float32)), bounds.background).rgb

@@ -66,7 +66,7 @@ def ground(seed: int = 0) -> TexturedGround:
     return TexturedGround(seed)
 
 
-def view(T: SE3, name: str = "", seed: int = 0) -> View:
+def textured_view(T: SE3, name: str = "", seed: int = 0) -> View:
     """Return an image of the ground with its depth."""
     return seen(T, CAMERA, name, seed)
 
@@ -90,13 +90,13 @@ def photograph(T: SE3, camera: Intrinsics) -> Float[Tensor, "h w 3"]:
 @functools.cache
 def training_views(count: int = 10) -> tuple[View, ...]:
     poses = orbit(1.8, count, elevation=(45.0, 75.0), seed=0)
-    return tuple(view(T, f"{number:04d}") for number, T in enumerate(poses))
+    return tuple(textured_view(T, f"{number:04d}") for number, T in enumerate(poses))
 
 
 @functools.cache
 def unseen() -> View:
     """Return an image of the ground that was not used to build the landmarks."""
-    return view(POSES[1], "unseen")
+    return textured_view(POSES[1], "unseen")
 
 
 @functools.cache

@@ -12,7 +12,7 @@ from torch import Tensor
 from bidnerf.results import pose_error
 from bidnerf.viewer.evidence import HERE, acceptance_figures, contests, last_answer, name_earlier, probable_poses
 from bidnerf.viewer.pictures import Json, jpeg_json, pack, png_json, quick_image
-from bidnerf.viewer.scene import frustum, rows_of
+from bidnerf.viewer.scene import frustum, matrix_rows
 from bidnerf_core.fields import RenderedImage, has_field, render_picture
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3, symbol
@@ -119,7 +119,7 @@ def answer_json(
         answer |= {"meaning": advice.meaning, "advice": advice.first}
     if truth is not None:
         truth = truth.translated(origin)
-        answer["truth"] = rows_of(truth)
+        answer["truth"] = matrix_rows(truth)
         if finite:
             error = pose_error(T, truth, unit)
             answer["error"] = float(error.translation), float(error.rotation_deg)
@@ -134,7 +134,7 @@ def answer_json(
         observed = jpeg_json(reduce_image(frame.rgb, small.width, small.height))
         answer |= {"camera": camera, "shape": frustum(frame.intrinsics), "observed": observed}
     if finite:
-        answer |= {"pose": rows_of(T), "ellipsoid": ellipsoid(T, localization.covariance)}
+        answer |= {"pose": matrix_rows(T), "ellipsoid": ellipsoid(T, localization.covariance)}
         if record is not None:
             answer["runner_up"] = _runner_up(scene, localization, record)
             if frame is not None and record.answers:
@@ -304,4 +304,4 @@ def _runner_up(scene: SceneMap, localization: Localization, record: SearchRecord
 
 
 def _other_pose(reason: str, T: SE3, probability: float | None = None) -> Json:
-    return {"reason": reason, "pose": rows_of(T), "rendered": None, "probability": probability}
+    return {"reason": reason, "pose": matrix_rows(T), "rendered": None, "probability": probability}

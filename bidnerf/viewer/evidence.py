@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from bidnerf.viewer.pictures import Json
-from bidnerf.viewer.scene import rows_of
+from bidnerf.viewer.scene import matrix_rows
 from bidnerf_core.geometry import SE3, symbol
 from bidnerf_core.localization import (
     ACCEPTED,
@@ -82,7 +82,7 @@ def _compare_modes(localization: Localization, answer: LandmarkAnswer) -> Json:
         if mode == best:
             name = name_earlier(localization, answer) or HERE
         name = "the mirror image" if answer.modes[mode].name == MIRROR else name
-        shown.append((name, probability, None if mode == best else rows_of(T)))
+        shown.append((name, probability, None if mode == best else matrix_rows(T)))
     others = {mode.name == MIRROR for mode in answer.modes[1:]}
     question = "Pose or mirror image?" if others == {True} else "This pose or another?"
     return _contest("This pose, another, or the mirror image?" if len(others) > 1 else question, shown)
@@ -221,7 +221,7 @@ def bar(value: float, threshold: float, at_least: bool) -> Json | None:
 
 
 @dataclass(frozen=True)
-class Figure:
+class EvidenceFigure:
     """A measure of a pose, and the threshold that it is compared with."""
 
     name: str
@@ -233,23 +233,25 @@ class Figure:
     pose: str = ""  # description of the measured pose, if it is not the pose found
 
     @staticmethod
-    def of(text: tuple[str, str, str], value: float, limit: float | None = None, is_least: bool = True) -> Figure:
+    def of(
+        text: tuple[str, str, str], value: float, limit: float | None = None, is_least: bool = True
+    ) -> EvidenceFigure:
         """Return a figure from its texts (name, format and meaning), its value and its bound."""
         name, spec, meaning = text
         if limit is None:
-            return Figure(name, format(value, spec), "", None, None, meaning)
+            return EvidenceFigure(name, format(value, spec), "", None, None, meaning)
         bound = f"{'at least' if is_least else 'at most'} {format(limit, spec)}"
         passed = value >= limit if is_least else value <= limit
-        return Figure(name, format(value, spec), bound, passed, bar(value, limit, is_least), meaning)
+        return EvidenceFigure(name, format(value, spec), bound, passed, bar(value, limit, is_least), meaning)
 
 
-def acceptance_figures(localization: Localization, record: SearchRecord | None) -> tuple[Figure, ...]:
+def acceptance_figures(localization: Localization, record: SearchRecord | None) -> tuple[EvidenceFigure, ...]:
     """Return the measures of the pose found and, if landmarks did not find it, of the last pose that they found; failures first."""
     measured, answer = localization.diagnostics, last_answer(record)
-    figures = list[Figure]()
+    figures = list[EvidenceFigure]()
     if localization.confidence is not None and not isinstance(measured, Support):
         meaning = "probability that the pose is right, from all figures together"
-        figures.append(Figure.of(("confidence", ".1%", meaning), localization.confidence, ACCEPTED))
+        figures.append(EvidenceFigure.of(("confidence", ".1%", meaning), localization.confidence, ACCEPTED))
     if isinstance(measured, Evidence):
         figures += _landmark_figures(measured)
     elif isinstance(measured, Support):
@@ -260,23 +262,23 @@ def acceptance_figures(localization: Localization, record: SearchRecord | None) 
     return tuple(sorted(figures, key=lambda figure: figure.passed is not False))  # what failed comes first
 
 
-def _landmark_figures(evidence: Evidence) -> Iterator[Figure]:
+def _landmark_figures(evidence: Evidence) -> Iterator[EvidenceFigure]:
     bounds = {bound.measure: bound for bound in LANDMARK_BOUNDS}
     for measure, text in MEASURES.items():
         value, bound = getattr(evidence, measure), bounds.get(measure)
         if value is None or (measure == "log10_nfa" and not evidence.searched):
             continue
         if bound is None:
-            yield Figure.of(text, value)
+            yield EvidenceFigure.of(text, value)
         elif measure == "log10_nfa":
             chance, limit = (10.0 ** min(max(power, -300), 300) for power in (value, bound.limit))
             exponents = bar(bound.limit / min(value, -0.01), 1.0, False)
-            yield replace(Figure.of(text, chance, limit, bound.is_least), bar=exponents)
+            yield replace(EvidenceFigure.of(text, chance, limit, bound.is_least), bar=exponents)
         else:
-            yield Figure.of(text, value, bound.limit, bound.is_least)
+            yield EvidenceFigure.of(text, value, bound.limit, bound.is_least)
 
 
-def _support_figures(measured: Support) -> Iterator[Figure]:
+def _support_figures(measured: Support) -> Iterator[EvidenceFigure]:
     for bound, value in measured.bounds:
         if bound.measure in WITHOUT_LANDMARKS:
-            yield Figure.of(WITHOUT_LANDMARKS[bound.measure], value, bound.limit, bound.is_least)
+            yield EvidenceFigure.of(WITHOUT_LANDMARKS[bound.measure], value, bound.limit, bound.is_least)

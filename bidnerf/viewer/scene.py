@@ -62,7 +62,7 @@ def map_json(scene: Map, thumbnails: int = 60) -> Json:
         "cameras": [
             {
                 "name": camera.name,
-                "pose": rows_of(camera.pose),
+                "pose": matrix_rows(camera.pose),
                 "shape": frustum(camera.intrinsics),
                 "thumbnail": jpeg_json(thumbnail(scene, camera)) if thumbnails and number % every == 0 else None,
             }
@@ -88,7 +88,7 @@ def thumbnail(scene: Map, camera: StoredCamera) -> Float[Tensor, "h w 3"]:
     return quick_image(scene, camera.intrinsics.at_most(80), camera.pose)  # pixels on the longer side
 
 
-def rows_of(T: SE3) -> tuple[float, ...]:
+def matrix_rows(T: SE3) -> tuple[float, ...]:
     """Return a pose as the 16 numbers of its matrix, row by row."""
     return tuple(T.matrix().detach().cpu().double().flatten().tolist())
 

@@ -38,7 +38,7 @@ from bidnerf_core.localization.posterior import (
     Posterior,
     agreement,
     cost_of,
-    fit,
+    fit_modes,
     fit_noise,
     fit_with_rays,
     graduate,
@@ -385,7 +385,7 @@ class Loop:
         if points is not None:
             terms.append(points)
             fused.append("depth")
-            best, minima = run_on(self.device, fit, best, terms, given, 5)
+            best, minima = run_on(self.device, fit_modes, best, terms, given, 5)
             found = self._posterior(minima, landmarks, -run_on(self.device, cost_of, points, best))
             near, both = run_on(self.device, agreement, points, found.chosen)
             others |= {"on_surface": float(near), "colour_inliers": float(both)}

@@ -252,14 +252,14 @@ Minima = tuple[Quadratic, States, Normal]
 """The quadratic model of all terms about each mode's state, and the states and normal equations at its minima under each explanation."""
 
 
-def fit(best: States, terms: Sequence[CostTerm], given: Explanations, steps: int) -> tuple[States, Minima]:
+def fit_modes(best: States, terms: Sequence[CostTerm], given: Explanations, steps: int) -> tuple[States, Minima]:
     """Return the refined state of each mode (g), and the minima about these states."""
     best, _ = descend(best, terms, steps)
-    quadratic = linearize(best, terms, given)
+    quadratic = linearize_modes(best, terms, given)
     return best, (quadratic, *quadratic.minimum(given.about(quadratic.here)))
 
 
-def linearize(best: States, terms: Sequence[CostTerm], given: Explanations) -> Quadratic:
+def linearize_modes(best: States, terms: Sequence[CostTerm], given: Explanations) -> Quadratic:
     """Return the quadratic model of the terms, without priors, about the state of each mode."""
     # The prior fixes nothing that any explanation frees.
     free = best.under(given.deviation.new_zeros(N), given.deviation.amax(0))
@@ -268,7 +268,7 @@ def linearize(best: States, terms: Sequence[CostTerm], given: Explanations) -> Q
 
 def settle(best: States, term: Landmarks, given: Explanations) -> tuple[States, Minima, States]:
     """Fit the landmarks with newly estimated noise; return the results of ``fit``, and then the most probable state of each mode."""
-    best, (quadratic, states, normal) = fit(term.with_noise(best), [term], given, 4)
+    best, (quadratic, states, normal) = fit_modes(term.with_noise(best), [term], given, 4)
     member = states.mode[None] == best.mode[:, None]
     log = torch.where(member, log_evidence(states, normal)[None], -torch.inf)
     return best, (quadratic, states, normal), states[log.argmax(-1)]
@@ -283,7 +283,7 @@ def fit_with_rays(
     """
     rays = rays.fitted(best[which])
     here, _ = descend(best[which], [*terms, rays], 4)
-    quadratic = linearize(best.with_rows(which, here), terms, given)
+    quadratic = linearize_modes(best.with_rows(which, here), terms, given)
     by_rays = Quadratic.of(rays(quadratic.here[which]), quadratic.here[which])
     quadratic = quadratic.with_rows_added(which, by_rays)
     hessian = torch.zeros_like(quadratic.hessian).index_add(0, which, by_rays.hessian)

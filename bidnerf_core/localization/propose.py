@@ -81,7 +81,9 @@ def consensus(
     }
     found: list[SE3] = []
     of_view = [image.T_ref_camera for image in query.images]
-    data = [((flat[p] * focal[p, None]).numpy(), points[p].numpy(), pinhole(float(focal[p[0]]))) for p in parts]  # host
+    data = [
+        ((flat[p] * focal[p, None]).numpy(), points[p].numpy(), poselib_camera(float(focal[p[0]]))) for p in parts
+    ]  # host
     for part, (pixels, there, model) in zip(parts, data, strict=True):
         pose, _ = poselib.estimate_absolute_pose(pixels, there, model, options, {})
         found.append(from_poselib(pose).inverse() @ of_view[int(view[part[0]])].inverse())
@@ -112,7 +114,7 @@ def inliers(
     return (off <= radius * query.threshold) & seen.front[0]
 
 
-def pinhole(focal: float) -> dict[str, object]:
+def poselib_camera(focal: float) -> dict[str, object]:
     """Return poselib's description of a pinhole camera with its principal point at the origin."""
     return {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
 

@@ -14,7 +14,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidnerf.evaluation import PROTOCOLS, Group, Plan, Trial, group_results
+from bidnerf.evaluation import PROTOCOLS, Plan, ResultGroup, Trial, group_results
 from bidnerf.scenes import orbit
 from bidnerf_core.geometry import SE3, look_at
 from optional import require
@@ -110,7 +110,7 @@ def test_a_part_is_recorded(tmp_path: Path, script: Script, monkeypatch: pytest.
 
 
 def test_failures_are_slower_than_any_success_and_equal_among_themselves(script: Script) -> None:
-    def group(label: str, *distances: float) -> Group:
+    def group(label: str, *distances: float) -> ResultGroup:
         trials = (Trial("m", "d", ("r",), (1.0,), seed) for seed in range(len(distances)))
         found = [trial_result(trial, [1.0, x, x]) for trial, x in zip(trials, distances, strict=True)]
         return replace(group_results(found)[0], label=label)

@@ -26,7 +26,7 @@ from bidnerf_core.mapping import (
 # Inside: triangulation, tracks and cells, each against an exhaustive computation
 from bidnerf_core.mapping.geometry.triangulation import parallax, refine_points, triangulate
 from bidnerf_core.mapping.landmarks.landmark_map import MOST_IN_CELL, LandmarkCells
-from bidnerf_core.mapping.landmarks.tracks import Matches, _mean_descriptors, link_tracks
+from bidnerf_core.mapping.landmarks.tracks import PairMatches, _mean_descriptors, link_tracks
 from bidnerf_core.progress import Progress, job_context
 from landmark_scene import PINHOLE, Points, looking_in, ring
 from optional import require
@@ -187,8 +187,8 @@ def test_parallax_is_the_angle_between_two_rays() -> None:
 
 
 def test_a_match_that_would_join_two_keypoints_of_an_image_is_left_out() -> None:
-    def match(a: int, b: int, ambiguity: float) -> Matches:
-        return Matches(torch.tensor([[a, b]]), torch.tensor([ambiguity]))
+    def match(a: int, b: int, ambiguity: float) -> PairMatches:
+        return PairMatches(torch.tensor([[a, b]]), torch.tensor([ambiguity]))
 
     track = link_tracks([(0, 1, match(0, 0, 0.1)), (1, 2, match(0, 0, 0.2)), (0, 2, match(1, 0, 0.5))], [2, 1, 1])
     assert track[0] == track[2] == track[3]

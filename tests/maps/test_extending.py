@@ -9,7 +9,8 @@ import pytest
 
 import bidnerf as bn
 import tiny
-from bidnerf.testing import training_views, view
+from bidnerf.testing import textured_view as view
+from bidnerf.testing import training_views
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.datasets import write_transforms
 from bidnerf_core.errors import Cancelled

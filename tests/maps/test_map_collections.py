@@ -19,7 +19,8 @@ import bidnerf_core.maps.collection as collections_module
 from bidnerf.scenes import orbit
 from bidnerf.service import Upload
 from bidnerf.service.worker import LoadedMaps
-from bidnerf.testing import BOUNDS, CAMERA, POSES, ground, view
+from bidnerf.testing import BOUNDS, CAMERA, POSES, ground
+from bidnerf.testing import textured_view as view
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.fields import NoField

@@ -29,7 +29,8 @@ from bidnerf import (
     train,
 )
 from bidnerf.results import overlay
-from bidnerf.testing import POSES, training_views, view
+from bidnerf.testing import POSES, training_views
+from bidnerf.testing import textured_view as view
 from bidnerf_core.errors import Cancelled
 from bidnerf_core.geometry import Similarity
 from bidnerf_core.mapping import BakeConfig

@@ -13,7 +13,7 @@ from bidnerf import SE3, Intrinsics, View
 from bidnerf.evaluation import faulty
 from bidnerf.testing import CAMERA, MapWithLandmarks, textured_map
 from bidnerf.testing import POSES as GROUND_POSES
-from bidnerf.testing import view as view_of_ground
+from bidnerf.testing import textured_view as view_of_ground
 from bidnerf_core.localization import settings_of
 from bidnerf_core.mapping import Features, Keypoints, LandmarkMap, Sift, build_landmarks
 from landmark_scene import PINHOLE, Points, looking_in, ring

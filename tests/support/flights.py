@@ -10,7 +10,8 @@ import torch
 
 from bidnerf import SE3, Frame, Localization, Localizer, Tracker
 from bidnerf.results import pose_error
-from bidnerf.testing import textured_map, view
+from bidnerf.testing import textured_map
+from bidnerf.testing import textured_view as view
 from bidnerf_core.geometry import look_at
 from bidnerf_core.localization import AutoConfig
 from localizations import assert_near

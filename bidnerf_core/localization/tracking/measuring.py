@@ -29,7 +29,7 @@ from bidnerf_core.localization.matching import (
     cells,
     log10_nfa,
 )
-from bidnerf_core.localization.posterior import TOLERANCE, Posterior, linearize, mass_within
+from bidnerf_core.localization.posterior import TOLERANCE, Posterior, linearize_modes, mass_within
 from bidnerf_core.localization.problem import SceneMap
 from bidnerf_core.localization.propose import LEAST_AGREEING, consensus
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
@@ -220,7 +220,7 @@ class Measurer:
         if fit.is_recognised:
             exact = torch.tensor(STATED[0][1:5], dtype=torch.float64)
             deviation[:, :4] = torch.hypot(exact, scatter)  # the camera is free
-            model = linearize(here, terms, given)
+            model = linearize_modes(here, terms, given)
             mixture = Posterior.of(*model.minimum(given.about(model.here)), model, term, scatter).mixture()
             if not bool(mixture.isfinite().all()):
                 why = Verdict(Outcome.UNDETERMINED, "the landmarks do not determine the pose")

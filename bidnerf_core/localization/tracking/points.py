@@ -23,7 +23,7 @@ from bidnerf_core.depth import DepthNoise
 from bidnerf_core.frames import Frame, visible_at
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.matching import cells, inlier_threshold, log10_nfa
-from bidnerf_core.localization.propose import from_poselib, pinhole, to_poselib
+from bidnerf_core.localization.propose import from_poselib, poselib_camera, to_poselib
 from bidnerf_core.mapping import FIRST_CENTRE, LandmarkMap, Landmarks, Sights, States, measured_depth, point_variance
 
 POINTS = 400
@@ -143,7 +143,7 @@ class Fit:
         threshold = inlier_threshold(camera)
         image = camera.unproject(points.pixels.double())[:, :2]
         options = {"loss_type": "CAUCHY", "loss_scale": threshold / 2}
-        known = points.positions.numpy(), to_poselib(start.inverse()), pinhole(focal)
+        known = points.positions.numpy(), to_poselib(start.inverse()), poselib_camera(focal)
         pose, _ = poselib.refine_absolute_pose((image * focal).numpy(), *known, options)
         T = from_poselib(pose).inverse()
         T = T.polished() if bool(T.is_rigid()) else start

@@ -37,7 +37,7 @@ from bidnerf_core.mapping.landmarks.features import (
 )
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap, concatenate
 from bidnerf_core.mapping.landmarks.tracks import (
-    Matches,
+    PairMatches,
     TrackedKeypoints,
     back_project,
     epipolar_matches,
@@ -237,7 +237,7 @@ def track_views(
     views: Sequence[View],
     features: str | Features = USUAL_FEATURES,
     config: LandmarkConfig = DEFAULT_LANDMARKS,
-    known: Callable[[Sequence[ImageKeypoints]], list[tuple[int, int, Matches]]] = lambda images: [],
+    known: Callable[[Sequence[ImageKeypoints]], list[tuple[int, int, PairMatches]]] = lambda images: [],
 ) -> TrackedViews:
     """Detect the keypoints of ``views``, match those of likely neighbours, and join the matches into tracks.
 
@@ -265,7 +265,7 @@ def _link_keypoints(
     images: Sequence[ImageKeypoints],
     pairs: Int[Tensor, "p 2"],
     step: Callable[[], None],
-    known: Sequence[tuple[int, int, Matches]] = (),
+    known: Sequence[tuple[int, int, PairMatches]] = (),
 ) -> TrackedKeypoints:
     """Match the keypoints of the pairs of images, and join the matches into tracks, starting with ``known`` ones of ambiguity 0."""
     listed = pairs.tolist()

@@ -58,21 +58,21 @@ def likely_pairs(poses: Sequence[SE3], neighbours: int) -> Int[Tensor, "p 2"]:
 
 
 @dataclass(frozen=True, eq=False)
-class Matches:
+class PairMatches:
     """Keypoint pairs of two images with similar descriptors, each near the other's epipolar line."""
 
     pairs: Int[Tensor, "p 2"]
     ambiguity: Float[Tensor, "p"]  # ratio of the best to the second-best descriptor distance
 
 
-def epipolar_matches(a: ImageKeypoints, b: ImageKeypoints) -> Matches:
+def epipolar_matches(a: ImageKeypoints, b: ImageKeypoints) -> PairMatches:
     """Return the pairs of keypoints of ``a`` and ``b`` that are mutual nearest neighbours near the epipolar lines.
 
     A match must also pass the ratio test among all keypoints of ``b``, because a keypoint that resembles many of them
     matches one near the line by chance.
     """
     if not len(a.keypoints) or not len(b.keypoints):
-        return Matches(torch.zeros((0, 2), dtype=torch.long), torch.zeros(0))
+        return PairMatches(torch.zeros((0, 2), dtype=torch.long), torch.zeros(0))
     distance = squared_distances(a.keypoints.descriptors, b.keypoints.descriptors)
     banded = distance.masked_fill(~_on_line(a, b), torch.inf)
     rows, partner = mutual_nearest(banded)
@@ -85,12 +85,12 @@ def epipolar_matches(a: ImageKeypoints, b: ImageKeypoints) -> Matches:
     next_in_band = banded[rows].masked_fill(near, torch.inf).amin(dim=1)
     good = (best < 0.85**2 * next_in_band) & (best < 0.95**2 * next_best)
     ambiguity = (best / next_best.clamp(min=1)).sqrt()
-    return Matches(torch.stack([rows, partner], dim=-1)[good], ambiguity[good])
+    return PairMatches(torch.stack([rows, partner], dim=-1)[good], ambiguity[good])
 
 
 def matches_of_points(
     images: Sequence[ImageKeypoints], observed: Sequence[Int[Tensor, "k"]], positions: Float[Tensor, "p 3"]
-) -> list[tuple[int, int, Matches]]:
+) -> list[tuple[int, int, PairMatches]]:
     """Return matches between keypoints at the projections of the same known point, without ambiguity.
 
     ``observed`` holds the numbers of the points (metres, world) that each image shows. A keypoint belongs to a point if the
@@ -118,7 +118,7 @@ def matches_of_points(
         (
             int(code) // len(images),
             int(code) % len(images),
-            Matches(ends[pair == n], torch.zeros(int((pair == n).sum()))),
+            PairMatches(ends[pair == n], torch.zeros(int((pair == n).sum()))),
         )
         for n, code in enumerate(pairs)
     ]
@@ -150,14 +150,14 @@ def _on_line(a: ImageKeypoints, b: ImageKeypoints) -> Bool[Tensor, "n m"]:
     return (across.abs_() <= band) & (along >= least)
 
 
-def link_tracks(matches: Sequence[tuple[int, int, Matches]], sizes: Sequence[int]) -> Int[Tensor, "m"]:
+def link_tracks(matches: Sequence[tuple[int, int, PairMatches]], sizes: Sequence[int]) -> Int[Tensor, "m"]:
     """Link pairwise matches into tracks and return the track label of each keypoint.
 
     ``matches`` holds, for each matched pair, the indices of its two images and the matches between their keypoints; ``sizes``
     holds the number of keypoints in each image. The m keypoints of all images are concatenated in image order. Labels are
     indices of keypoints, hence not consecutive; an unmatched keypoint is a track of its own.
 
-    Matches are linked in order of increasing ambiguity. A match that would put two keypoints of the same image into one track
+    PairMatches are linked in order of increasing ambiguity. A match that would put two keypoints of the same image into one track
     is dropped, because a single wrong match would otherwise merge two correct tracks.
     """
     first = np.concatenate([[0], np.cumsum(sizes)])
