@@ -157,7 +157,7 @@ def link_tracks(matches: Sequence[tuple[int, int, PairMatches]], sizes: Sequence
     holds the number of keypoints in each image. The m keypoints of all images are concatenated in image order. Labels are
     indices of keypoints, hence not consecutive; an unmatched keypoint is a track of its own.
 
-    PairMatches are linked in order of increasing ambiguity. A match that would put two keypoints of the same image into one track
+    Matches are linked in order of increasing ambiguity. A match that would put two keypoints of the same image into one track
     is dropped, because a single wrong match would otherwise merge two correct tracks.
     """
     first = np.concatenate([[0], np.cumsum(sizes)])
