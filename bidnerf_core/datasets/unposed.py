@@ -6,7 +6,7 @@ import contextlib
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.capture import warn_about
@@ -18,6 +18,7 @@ from bidnerf_core.io import read_header
 from bidnerf_core.registry import Plugins, interface_defects
 
 
+@runtime_checkable
 class PosedPhotos(Protocol):
     """The record that a poser returns."""
 
@@ -27,6 +28,7 @@ class PosedPhotos(Protocol):
         ...
 
 
+@runtime_checkable
 class Poser(Protocol):
     """A function that finds the poses of photos without any, and writes them as a dataset."""
 

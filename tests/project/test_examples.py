@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from bidnerf.evaluation import open_scene
 from bidnerf.scenes import closed_form_data, orbit
 from bidnerf_core import registry
 from bidnerf_core.fields import DEPTH_RESIDUALS
@@ -37,6 +38,8 @@ def test_example_runs(
     # Fields that are trained for a few steps need no more than a few images, whose rendering takes longer.
     module = sys.modules[closed_form_data.__module__]  # a function of the same name shadows it
     monkeypatch.setattr(module, "orbit", lambda radius, count, **more: orbit(radius, min(count, 8), **more))
+    trials = sys.modules[open_scene.__module__]  # whose cache would keep the shortened data for other tests
+    monkeypatch.setattr(trials, "_read_scene", trials._read_scene.__wrapped__)
     monkeypatch.chdir(tmp_path)
     for steps, fewer in SHORTENED.items():
         text = text.replace(steps, fewer)
