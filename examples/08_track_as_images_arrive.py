@@ -14,7 +14,7 @@ from pathlib import Path
 import imageio.v3 as iio
 
 import bidnerf as bn
-from bidnerf.testing import textured_map, view
+from bidnerf.testing import textured_map, textured_view
 from bidnerf_core.geometry import look_at
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -28,7 +28,7 @@ given.folder.mkdir(exist_ok=True)
 def record():
     for number in range(0 if given.map else 4):
         pose = look_at((0.7 - 0.03 * number, 0.4, 1.5), (0.0, 0.0, 0.0))
-        iio.imwrite(given.folder / f"{number}.png", (255 * view(pose).frame.rgb).round().byte().numpy())
+        iio.imwrite(given.folder / f"{number}.png", (255 * textured_view(pose).frame.rgb).round().byte().numpy())
 
 
 tracker = bn.Tracker(bn.Localizer(bn.load_map(given.map) if given.map else textured_map(surface=True)))
