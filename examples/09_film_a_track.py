@@ -12,7 +12,8 @@ import av
 
 import bidnerf as bn
 from bidnerf.results import overlay
-from bidnerf.testing import textured_map, textured_view
+from bidnerf.testing import textured_map
+from bidnerf.testing import textured_view as view
 from bidnerf_core.datasets import capture_of
 from bidnerf_core.geometry import look_at
 
@@ -28,9 +29,7 @@ if given.map:
 else:
     eyes = [(0.7 - 0.03 * number, 0.4, 1.5) for number in range(3)]
     scene = textured_map(surface=True)
-    sequence = capture_of(
-        [textured_view(look_at(eye, (0.0, 0.0, 0.0)), str(n)) for n, eye in enumerate(eyes)], Path("ground")
-    )
+    sequence = capture_of([view(look_at(eye, (0.0, 0.0, 0.0)), str(n)) for n, eye in enumerate(eyes)], Path("ground"))
 
 with av.open(given.out, "w") as film:
     stream = film.add_stream("libx264", rate=10)
