@@ -48,12 +48,12 @@ FREEDOM = 30.0
 CORRELATION = (3.0, 1.5)
 """Prior of the number of keypoints that count as one: median over maps, and standard deviation of the logarithm.
 
-Maps of rendered images have 0.3 to 0.4 (the errors of their landmarks are overestimated), maps of photos 5 to 80.
+Three maps of rendered images gave 0.3 (the errors of their landmarks are overestimated), three of photos 1 to 5.
 """
 SCATTER = (0.004, 0.7)
-"""The same of the standard deviations of spurious corrections of a camera."""
+"""Median and width, as above, of the prior of the standard deviations of spurious corrections of a camera."""
 EXCESS, LEAST_EXCESS = (1.0, 1.0), 0.3
-"""The same of the factors by which points and rays exceed the information of independent measurements, and the least factor.
+"""Prior, as above, of the factors by which the information of points and rays is overstated, and the least factor.
 
 Images with poses to which a field was trained show smaller errors than others.
 """
