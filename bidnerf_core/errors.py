@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-from collections.abc import Collection, Iterator, Sequence
+import re
+from collections.abc import Callable, Collection, Iterator, Sequence
 
 
 class InputError(ValueError):
     """Raised for an input that cannot be used.
+
+    The message names settings as Python does, in backticks; programs with other names for them use ``spelled``.
 
     The message is a single line, ``where: found, expected ...``, which can be shown to the user unchanged; its parts
     are attributes: ``where`` is the file, frame, argument or setting that is wrong, or None if the message does not begin
@@ -64,6 +67,11 @@ def spelling_hint(name: str, known: Collection[str], otherwise: str = "") -> str
     """Return ``, did you mean 'NAME'?`` with the closest name in ``known``, or ``otherwise`` if none is similar."""
     near = difflib.get_close_matches(name, known, n=1)
     return f", did you mean {near[0]!r}?" if near else otherwise
+
+
+def spelled(message: str, spell: Callable[[str], str] = str) -> str:
+    """Return a message in which ``spell`` has written the name of each setting, which stands in backticks."""
+    return re.sub(r"`(\w+)`", lambda name: spell(name[1]), message)
 
 
 def amount(count: int, noun: str) -> str:

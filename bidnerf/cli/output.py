@@ -12,7 +12,8 @@ from typing import Any
 
 from rich.console import Console
 
-from bidnerf_core.errors import InputError, UsageError, printable
+from bidnerf.cli.program import option_name
+from bidnerf_core.errors import InputError, UsageError, printable, spelled
 
 
 class _Progress(Console):
@@ -27,8 +28,8 @@ console = _Progress(stderr=True, highlight=False, soft_wrap=True)
 
 
 def say(message: str) -> None:
-    """Print a line on stderr."""
-    console.print(printable(message), markup=False)
+    """Print a line on stderr, with the options of the settings that it names."""
+    console.print(printable(spelled(message, option_name)), markup=False)
 
 
 def show(line: str) -> None:

@@ -25,6 +25,7 @@ from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
+from bidnerf.cli.program import option_name
 from bidnerf_core.errors import InputError, UsageError, enumeration, spelling_hint
 from bidnerf_core.settings import Allowed, Expert
 
@@ -114,7 +115,7 @@ class Parameter:
     @property
     def flag(self) -> str:
         """The option string, such as --depth-unit."""
-        return f"--{self.name.rstrip('_').replace('_', '-')}"
+        return option_name(self.name)
 
     @property
     def left_out(self) -> frozenset[str]:
@@ -208,7 +209,7 @@ def as_usage_error(error: InputError) -> UsageError:
     """Return the error about a setting as one about the option of its name."""
     if error.where not in (None, "config"):
         return UsageError(error)
-    text = re.sub(r"^(\w+)(?= is )", lambda name: f"--{name[0].replace('_', '-')}", error.found)
+    text = re.sub(r"^(\w+)(?= is )", r"`\1`", error.found)
     return UsageError(text, expected=error.expected)
 
 

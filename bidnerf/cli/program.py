@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TextIO
 
 from bidnerf.cli.signals import Interrupted, interruptions
-from bidnerf_core.errors import Cancelled, InputError, InputWarning, UsageError, printable, spelling_hint
+from bidnerf_core.errors import Cancelled, InputError, InputWarning, UsageError, printable, spelled, spelling_hint
 from bidnerf_core.registry import Plugins, list_plugins
 
 
@@ -34,6 +34,11 @@ COMMANDS: Plugins[Callable[..., None]] = Plugins("commands", _command_defects)
 DONE, BAD_INPUT, WRONG_USAGE, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
 """Exit statuses; the last two are 128 plus the number of the signal, as is customary for shells. SIGTERM and SIGHUP lead to
 143 and 129."""
+
+
+def option_name(name: str) -> str:
+    """Return the option of a parameter or a setting, such as --depth-unit for ``depth_unit``."""
+    return f"--{name.replace('_', '-')}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -148,7 +153,7 @@ class _Lines(logging.Handler):
 def _report(name: str, message: str, status: int, more: str = "") -> int:
     """Print the reason for a failure, or a warning, on one line, and return ``status``, even if stderr is closed."""
     with contextlib.suppress(OSError):
-        print(f"{name}: {printable(' '.join(message.splitlines()))}", file=sys.stderr)
+        print(f"{name}: {printable(' '.join(spelled(message, option_name).splitlines()))}", file=sys.stderr)
         print(more, end=more and "\n", file=sys.stderr, flush=True)
     return status
 

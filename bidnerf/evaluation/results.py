@@ -233,7 +233,7 @@ class ResultsFile:
             raise InputError(f"cannot be written ({error.strerror})", where=path, expected="a file") from error
         if not take_lock(self._file.fileno()):
             self.__exit__()
-            raise FileInUse("another process is writing to it; name another --out", where=path)
+            raise FileInUse("another process is writing to it; name another file (`out`)", where=path)
         self._file.seek(0)
         return self._file
 

@@ -195,7 +195,7 @@ def missing_trials(trials: Sequence[Trial], file: ResultsFile, scene: Scene | No
     Settings unknown to the version that made a result are assumed to have had their defaults.
     """
     digests = dict[Any, InputDigests]()
-    advice = "name another --out, or remove the file to start again"
+    advice = "name another file (`out`), or remove the file to start again"
     for trial in (trial for trial in trials if trial in file):
         result = file[trial]
         stored, dataset = scene or open_scene(trial.map, trial.data, trial)
@@ -281,7 +281,7 @@ def executor_of(workers: Workers, trials: int, on_cpu: bool) -> Iterator[tuple[E
 
             client = Client(workers, timeout=PATIENCE, set_as_default=False)
         except ImportError as error:
-            raise InputError("--dask needs dask, which is missing: pip install 'bidnerf[cluster]'") from error
+            raise InputError("a cluster needs dask, which is missing: pip install 'bidnerf[cluster]'") from error
         except (OSError, ValueError) as error:  # TimeoutError is an OSError
             raise InputError(
                 f"no dask scheduler at {workers} ({error})", expected="one such as tcp://host:8786"

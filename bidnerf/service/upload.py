@@ -7,10 +7,10 @@ import os
 from pathlib import Path
 
 from bidnerf.results import read_pose
-from bidnerf.service.models import CAMERAS, WIDEST, Upload
-from bidnerf_core.camera import WAYS, WAYS_OF_PHOTO, CameraSource
+from bidnerf.service.models import WIDEST, Upload
+from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets import DatasetOptions, Photos
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, spelled
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import is_heif, read_header
 
@@ -60,7 +60,4 @@ def read_upload(upload: Upload, usual: CameraSource, folder: Path, max_pixels: f
 
 def public_message(error: InputError, folder: Path) -> str:
     """Return the message of an error for clients: without the folder of the request, and with the names of the request's parameters."""
-    text = str(error).replace(f"{folder}{os.sep}", "")
-    for ways in (WAYS_OF_PHOTO, WAYS):
-        text = text.replace(ways, f"{', '.join(CAMERAS[:-1])} or {CAMERAS[-1]}")
-    return text
+    return spelled(str(error).replace(f"{folder}{os.sep}", ""))

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from bidnerf.viewer.app import LiveView
 
 PORT = 8010
-NEEDS = "the live viewer needs the extra 'viewer' (pip install 'bidnerf[viewer]'); --save writes a page without it"
+NEEDS = "the live viewer needs the extra 'viewer' (pip install 'bidnerf[viewer]'); `save` writes a page without it"
 
 
 def require_viewer() -> None:

@@ -25,7 +25,6 @@ from .rolling_shutter import MotionPrior as MotionPrior
 from .rolling_shutter import exposure_times as exposure_times
 from .rolling_shutter import poses_of_rows as poses_of_rows
 from .source import WAYS as WAYS
-from .source import WAYS_OF_PHOTO as WAYS_OF_PHOTO
 from .source import CameraSource as CameraSource
 from .source import Raster as Raster
 from .source import ResolvedCamera as ResolvedCamera

@@ -18,8 +18,7 @@ from bidnerf_core.camera.lenses import Camera, Lens
 from bidnerf_core.errors import InputError, errors_in
 
 CameraKind = TypeVar("CameraKind", Intrinsics, Lens, Camera)
-WAYS = "--camera FILE, --focal PX or --hfov DEG (camera=, focal=, hfov= in Python)"
-WAYS_OF_PHOTO = "--camera FILE, --focal PX or --hfov DEG (in Python camera=, focal=, hfov=, or the photo's path for a localizer, which assumes its map's cameras)"
+WAYS = "`camera` (a file), `focal` (pixels) or `hfov` (degrees)"
 
 
 @dataclass(frozen=True)
@@ -171,7 +170,7 @@ def folder_camera(
         raise InputError(
             f"{unknown};",
             where=folder,
-            expected=f"its camera: camera.json or cameras.txt in the folder, or --camera with {ways} (camera= in Python)",
+            expected=f"its camera: camera.json or cameras.txt in the folder, or `camera` with {ways}",
         )
     return CameraSource(camera)
 
@@ -209,7 +208,7 @@ def camera_from_exif(where: str, raster: Raster, exif: Exif, may_be_cropped: boo
         if not may_be_cropped:
             raise InputError(
                 f"image is {raster.width}x{raster.height}, but was {taken[0]}x{taken[1]} when EXIF was written; give its"
-                f" camera: {WAYS_OF_PHOTO}",
+                f" camera: {WAYS}",
                 where=where,
             )
         ratio = max(raster.width / taken[0], raster.height / taken[1])
@@ -227,7 +226,7 @@ def camera_from_exif(where: str, raster: Raster, exif: Exif, may_be_cropped: boo
         zoom = f" and digital zoom {exif.digital_zoom:g}" if exif.digital_zoom != 1 else ""
         origin = f"{exif.focal_mm:g} mm, pixel size{zoom} in EXIF"
     else:
-        raise InputError("no focal length in EXIF", where=where, expected=f"a camera: {WAYS_OF_PHOTO}")
+        raise InputError("no focal length in EXIF", where=where, expected=f"a camera: {WAYS}")
     try:
         resolved = _describe(Intrinsics.from_focal(focal, *raster.upright_size), origin)
     except InputError as error:

@@ -160,7 +160,7 @@ def _track(views: Sequence[View], features: str, trust_poses: bool, depth_unit: 
 def _check_poses(images: Sequence[ImageKeypoints]) -> None:
     """Raise ``InputError`` if the poses contradict most pairs of images."""
     if (contradiction := pose_contradiction(images)) is not None:
-        raise InputError(f"{contradiction.sentence} (--trust-poses, trust_poses in Python, trains with them anyway)")
+        raise InputError(f"{contradiction.sentence} (`trust_poses` trains with them anyway)")
 
 
 def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> None:
@@ -180,8 +180,8 @@ def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> 
     if depth_unit is not None:
         right = depth_unit / ratio
         remedy = (
-            f"if the poses are in metres, a step of the depth images is {right:.3g} m and not {depth_unit:.3g} m (--depth-unit"
-            f" {right:.3g}, depth_unit in Python, or depth_unit_scale_factor in a transforms.json)"
+            f"if the poses are in metres, a step of the depth images is {right:.3g} m and not {depth_unit:.3g} m (`depth_unit`"
+            f" {right:.3g}, or depth_unit_scale_factor in a transforms.json)"
         )
     raise InputError(
         f"{finding};",

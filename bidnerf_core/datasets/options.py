@@ -60,7 +60,7 @@ class DatasetOptions:
     def __post_init__(self) -> None:
         if self.masks is None and self.mask_hides != "black":
             raise UsageError(
-                f"--mask-hides {self.mask_hides} was given without --masks", expected="the folder of masks"
+                f"`mask_hides` {self.mask_hides} was given without `masks`", expected="the folder of masks"
             )
         if self.depth_unit is None:
             return
@@ -140,7 +140,7 @@ class DatasetOptions:
         if register is None or register is True:
             if register and own is None:
                 raise InputError(
-                    "its depth sensor is not known", where=where, expected="the file of one (register_depth=)"
+                    "its depth sensor is not known", where=where, expected="the file of one (`register_depth`)"
                 )
             return own
         if register is False:

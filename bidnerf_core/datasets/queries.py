@@ -27,7 +27,7 @@ class Query:
 
     name: str
     views: tuple[View, ...]
-    truth: SE3 | None = None  # T_world_camera if the dataset has it; used only for errors and --perturb
+    truth: SE3 | None = None  # T_world_camera if the dataset has it; used only for errors and perturbed starts
     file: Path | None = None  # of the last image
 
     @property
@@ -125,14 +125,14 @@ class DatasetFrames:
         if not listed:
             raise InputError(f"split {split!r} has no frames", where=dataset.path)
         if window > len(listed):
-            raise UsageError(f"--window is {window}", expected=f"1 to {len(listed)}")
+            raise UsageError(f"`window` is {window}", expected=f"1 to {len(listed)}")
         self._rigs = [names] if names else [(name,) for name in listed]
         if window > 1 and self._rigs[0][0] in listed:  # an unknown name is rejected on reading
             self._rigs = [windowed(listed, listed.index(rig[0]), window) for rig in self._rigs]
             for rig in self._rigs:
                 if window > len(rig):
                     log.info(
-                        f"--window {window}: {rig[-1]} has only {len(rig) - 1} before it in split {split!r}; a rig of"
+                        f"`window` {window}: {rig[-1]} has only {len(rig) - 1} before it in split {split!r}; a rig of"
                         f" {len(rig)}"
                     )
 
@@ -195,7 +195,7 @@ def depth_files(photos: Sequence[Path], depth: Sequence[Path]) -> dict[Path, Pat
         return {by_stem[stem]: file for stem, file in zip(stems, depth, strict=True)}
     if len(depth) != len(photos):
         raise UsageError(
-            f"--depth names {amount(len(depth), 'file')} for {amount(len(photos), 'photo')}",
+            f"`depth` names {amount(len(depth), 'file')} for {amount(len(photos), 'photo')}",
             expected="one for each, in the same order or matched by name",
         )
     return dict(zip(photos, depth, strict=True))

@@ -48,21 +48,21 @@ def read_capture(
         raise no_dataset(path, readers, or_else)
     source = options.camera_source
     given: list[tuple[OpenQuestion, bool, str]] = [
-        ("camera", source.is_given, "is a dataset with its own cameras; leave out the camera"),
+        ("camera", source.is_given, "is a dataset with its own cameras; leave out `camera`"),
         (
             "register_depth",
             options.registration not in (None, False),
-            "has no depth, or its depth is already registered to its images; leave out register_depth",
+            "has no depth, or its depth is already registered to its images; leave out `register_depth`",
         ),
         (
             "depth_unit",
             options.depth_unit is not None,
-            "has no depth images, or depth in a fixed unit; leave out depth_unit",
+            "has no depth images, or depth in a fixed unit; leave out `depth_unit`",
         ),
         (
             "focal",
             source.is_given and source.camera is None,
-            "is a dataset; give a camera with all intrinsics (camera=)",
+            "is a dataset; give a camera with all intrinsics (`camera`)",
         ),
     ]
     for option, is_given, problem in given:

@@ -24,7 +24,7 @@ from bidnerf_core.io import IMAGE_SUFFIXES, decode, resample_nearest
 
 HiddenColour = Literal["black", "white"]
 """The mask colour that marks pixels to ignore."""
-INVERTED = "if it marks what should be used, the masks are inverted (--mask-hides, mask_hides in Python)"
+INVERTED = "if it marks what should be used, the masks are inverted (`mask_hides`)"
 
 
 @dataclass(frozen=True)

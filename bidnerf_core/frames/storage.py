@@ -70,7 +70,7 @@ class PixelStore:
         except OSError as error:
             raise InputError(
                 f"no room for {self._expected / 1e6:.0f} MB of images ({error.strerror or error}), free that"
-                " much, or read them smaller (--largest, largest=)",
+                " much, or read them smaller (`largest`)",
                 where=self._folder or tempfile.gettempdir(),
             ) from error
 

@@ -213,7 +213,7 @@ def output_folder(
         if not all(is_temporary(file.name) or is_leftover(file) for file in files):
             raise InputError(
                 f"{described(out) or 'exists already and is not empty'}; name another folder, or overwrite it"
-                " (--overwrite)",
+                " (`overwrite`)",
                 where=out,
             )
 

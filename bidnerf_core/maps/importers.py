@@ -123,7 +123,7 @@ def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
         return able[0]
     if able:
         raise InputError(
-            f"{enumeration([each for each, _ in able])} can each read it; choose one of them (--as)", where=path
+            f"{enumeration([each for each, _ in able])} can each read it; choose one of them (`importer`)", where=path
         )
     known = "; ".join(f"{each} reads {importer.summary}" for each, importer in found)
     absent = [f"bidnerf-{each} for {what}" for each, what in OFFERED.items() if each not in IMPORTERS]

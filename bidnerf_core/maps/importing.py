@@ -232,7 +232,7 @@ def _stored_views(structure: Structure, features: str, origin: Origin) -> tuple[
         raise InputError(
             f"its descriptors have {channels} channels, those of {features!r} {probe.descriptors.shape[1]}",
             where=capture.path,
-            expected="the detector that made them (--landmark-features)",
+            expected="the detector that made them (`landmark_features`)",
         )
     views, images, labels = list[View](), list[ImageKeypoints](), list[Tensor]()
     for shot, keypoints, observed in zip(capture.shots, structure.keypoints, structure.observed, strict=True):
@@ -271,14 +271,14 @@ def _report_extent(found: ImportedField, where: str, unit: LengthUnit) -> None:
         lower, upper = robust_box(found.points, margin=0.0)
         size = (upper - lower).tolist()
     extent = " x ".join(f"{side:.3g}" for side in size)
-    unknown = "; its unit is not stored (--scale gives its length in metres)"
+    unknown = "; its unit is not stored (`scale` gives its length in metres)"
     log.info(f"{where}: extent {extent}{' metres' if unit == 'metres' else unknown}")
     # The longest side of a plausible scene is between 5 cm and 500 m; other lengths are probably in another unit.
     if not 0.05 <= max(size) <= 500:
         large = "very large in metres; are its lengths millimetres?"
         tiny = "tiny in metres; are its lengths kilometres or an arbitrary unit?"
         doubt = f"{extent} would be {large if max(size) > 500 else tiny}"
-        warnings.warn(f"{where}: {doubt} --scale changes them", InputWarning, stacklevel=3)
+        warnings.warn(f"{where}: {doubt} `scale` changes them", InputWarning, stacklevel=3)
 
 
 @torch.no_grad()
@@ -308,7 +308,7 @@ def _bake(scene: Map, found: ImportedField, views: Sequence[View], config: BakeC
         return scene.with_surface(views, config, surface)
     if not views:
         log.info(
-            f"{name}: landmarks are from rendered images, which match photos less well; --photos builds them from photos,"
+            f"{name}: landmarks are from rendered images, which match photos less well; `photos` builds them from photos,"
             " as in training"
         )
     scene, tracked = scene.with_landmarks(views, not views)

@@ -109,7 +109,7 @@ def locate_point(scene: Map, point: Place) -> Float[Tensor, "3"]:
     hint = spelling_hint(missing, names, f", expected a name such as {names[0]!r}")
     raise InputError(
         f"no place {point!r} in the map: none of its {len(names)} cameras is called {missing!r}{hint} (photos held out"
-        " for tests, every eighth unless trained with --split all, are not in the map); or give NAME@U,V for what a"
+        " for tests, every eighth unless `split` was all in the training, are not in the map); or give NAME@U,V for what a"
         " camera shows at a pixel, or coordinates X,Y,Z"
     )
 

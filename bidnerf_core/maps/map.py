@@ -258,7 +258,7 @@ class Map:
             if data is None and not rendered_landmarks and self.info.landmark_source == "photos":
                 raise InputError(
                     f"its landmarks are from photos and detector {self.info.landmark_features!r}; for"
-                    f" {features!r}, give the photos again (--data) or use --rendered-landmarks",
+                    f" {features!r}, give the photos again (`data`) or use `rendered_landmarks`",
                     where=self.name,
                 )
             scene = replace(self, info=replace(self.info, landmark_features=features))
@@ -308,7 +308,7 @@ class Map:
                 except InputError as error:  # damaged, so that they are replaced
                     log.info(str(error))
             if photos is not None:
-                log.info(f"{self.name}: its landmarks from photos are kept; --rendered-landmarks replaces them")
+                log.info(f"{self.name}: its landmarks from photos are kept; `rendered_landmarks` replaces them")
                 return replace(self, landmarks=photos), None
         started, info, landmarks = time.monotonic(), self.info, None
         source: LandmarkSource = "photos" if views else "rendered images"
@@ -367,7 +367,7 @@ class Map:
         return self.with_parts(surface)
 
     def _no_cameras(self) -> InputError:
-        return InputError("holds no cameras to render from; give a dataset of its views with --data", where=self.name)
+        return InputError("holds no cameras to render from; give a dataset of its views (`data`)", where=self.name)
 
     def with_survey(self, views: Sequence[View], tracked: TrackedViews | None) -> Map:
         """Return the map with the capture record of the photos ``views`` and the field's colour error on them.

@@ -252,7 +252,7 @@ def report_finished_parts(folder: Path | None) -> Iterator[None]:
         stages = (("landmarks", info.landmarks), ("field", info.step), ("surface", info.surface))
         raise Cancelled(
             f"{folder}: {stopped}; the map has its {enumeration([part for part, done in stages if done]) or 'nothing'}"
-            " so far; --resume continues, --finish ends it as it is"
+            " so far; `resume` continues, `finish` ends it as it is"
         ) from stopped
 
 
@@ -311,7 +311,7 @@ def check_resumable(folder: Path, baking: bool = True) -> MapInfo:
     try:
         info = load_info(folder)
     except InputError as error:
-        raise InputError(f"{error}; nothing to resume, train without --resume") from error
+        raise InputError(f"{error}; nothing to resume, train without `resume`") from error
     if info.complete and not (baking and (info.surface is None or info.capture is None)):
         raise InputError(
             f"training is complete ({amount(info.step, 'step')}){'' if info.surface is None else ' and baked'}, nothing"
@@ -373,11 +373,11 @@ def _check_same_views(out: Path, info: MapInfo, read: ReadViews, split: str) -> 
     background, outcome = info.bounds.background, "resuming keeps"
     for before, now, what in (
         (background, read.background if read.source else background, "background {}, got {}"),
-        (info.hidden, read.hidden, f"{{}} pixels hidden by masks, got {{}}; {outcome} the masks (--masks)"),
+        (info.hidden, read.hidden, f"{{}} pixels hidden by masks, got {{}}; {outcome} the masks (`masks`)"),
         (
             info.sparse_depth,
             read.sparse_depth,
-            f"the depth of {{}} pixels from points, got {{}}; {outcome} the points (--depth-points) and their selection",
+            f"the depth of {{}} pixels from points, got {{}}; {outcome} the points (`depth_points`) and their selection",
         ),
     ):
         if before != now:
@@ -439,7 +439,7 @@ def train_field(
         backend.train(field, views, config, report)
     except TrainingStopped as stopped:
         outcome, advice = (
-            ("cancelled", ", nothing is stored") if out is None else ("saved", "; --resume continues from there")
+            ("cancelled", ", nothing is stored") if out is None else ("saved", "; `resume` continues from there")
         )
         raise Cancelled(f"{where}: {outcome} after step {stopped.step}{advice}") from stopped
     report.finish(field)

@@ -174,7 +174,7 @@ def _read_dataset(data: Capture, split: str, largest: int | None, folder: Path |
                     before, after = (f"{f.intrinsics.width}x{f.intrinsics.height}" for f in (view.frame, small))
                     log.info(
                         f"{where}: {amount(len(shots), 'image')} of {before} read at {after},"
-                        f" {len(shots) * bytes_of(small) / 1e6:.0f} MB; --largest (largest=) sets another size"
+                        f" {len(shots) * bytes_of(small) / 1e6:.0f} MB; `largest` sets another size"
                     )
             views.append(replace(view, frame=store.store(view.frame.at_most(limit))))
         count(number, len(shots))

@@ -31,7 +31,7 @@ from refusals import refused
 SIZE = (4032, 3024)
 PHOTO = Raster(*SIZE, UPRIGHT)
 PORTRAIT = Raster(*SIZE, Orientation.from_exif(6))
-WAYS = "--camera FILE, --focal PX or --hfov DEG"
+WAYS = "`camera` (a file), `focal` (pixels) or `hfov` (degrees)"
 
 
 def found(exif: Exif = Exif(), raster: Raster = PHOTO, **given: Any) -> Intrinsics:  # noqa: B008

@@ -100,4 +100,4 @@ def test_options_of_datasets_need_one(bidnerf: Run, shared: Path, given: Path, t
     found = bidnerf("extend", shared / "map", photo, "--camera", given / "camera.json")
     assert_refused(found, 2, "--camera", photo)
     words = ["evaluate", "demo:blobs", "--out", tmp_path / "r.jsonl", "--depth-unit", 0.001]
-    assert_refused(bidnerf(*words), 1, "leave out depth_unit")
+    assert_refused(bidnerf(*words), 1, "leave out --depth-unit")

@@ -139,7 +139,7 @@ def test_places_without_a_sequence(tmp_path: Path) -> None:
     with refused(where=tmp_path / "notes.txt", found="is a file", expected="the folder of a dataset, or a video (.mp4"):
         open_sequence(tmp_path / "notes.txt")
     write_transforms(tmp_path, {"train": tiny.views(1)})
-    with refused(where=tmp_path, found="a dataset with its own cameras; leave out the camera"):
+    with refused(where=tmp_path, found="a dataset with its own cameras; leave out `camera`"):
         open_sequence(tmp_path, camera=tiny.CAMERA)
 
 

@@ -127,7 +127,7 @@ def test_a_rotated_video_is_upright(clip: Path, tmp_path: Path, degrees: int) ->
 
 
 def test_no_camera_is_an_error(clip: Path) -> None:
-    with refused(where=clip, found="its focal length", expected="a camera: --camera FILE"):
+    with refused(where=clip, found="its focal length", expected="a camera: `camera` (a file)"):
         open_sequence(clip)
 
 

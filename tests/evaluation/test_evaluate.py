@@ -234,7 +234,7 @@ def test_frames_that_masks_hide_wholly_are_named_and_left_out(
     assert {row.frame for row in found.results[0]} == set(names[1:])
     with refused(where=place, found=f"1 whole frame of 1, not tried: {names[0]};") as caught:
         bn.evaluate(scene, data, quick(frames=names[:1], images=images))
-    assert "--mask-hides" in caught.error.found
+    assert "`mask_hides`" in caught.error.found
 
 
 def test_a_file_of_results_that_cannot_be_made_is_refused(tmp_path: Path) -> None:

@@ -115,7 +115,7 @@ def after(steps: int) -> dict[str, Any]:
 
 
 def test_cancelled_and_resumed_equals_uninterrupted(whole: bn.Map, tmp_path: Path) -> None:
-    with pytest.raises(bn.Cancelled, match=r"saved after step 5; --resume"):
+    with pytest.raises(bn.Cancelled, match=r"saved after step 5; `resume`"):
         trained(tmp_path / "half", **after(5))
     info = load_info(tmp_path / "half")
     assert (info.step, info.complete) == (5, False)
@@ -124,7 +124,7 @@ def test_cancelled_and_resumed_equals_uninterrupted(whole: bn.Map, tmp_path: Pat
     assert_same_field(resumed, whole)
     with refused(where=tmp_path / "half", found="complete (12 steps), nothing to resume"):
         bn.resume(tmp_path / "half", tiny.views(), bake=False)
-    with pytest.raises(bn.Cancelled, match=r"has its landmarks, field and surface so far; --resume continues"):
+    with pytest.raises(bn.Cancelled, match=r"has its landmarks, field and surface so far; `resume` continues"):
         bn.resume(
             tmp_path / "half",
             tiny.views(),

@@ -51,7 +51,7 @@ from bidnerf.service.pool import Pool
 from bidnerf.service.server import maps_by_name
 from bidnerf.service.web import SAFE, Gate
 from bidnerf.viewer import require_viewer
-from bidnerf_core.camera import WAYS, WAYS_OF_PHOTO
+from bidnerf_core.camera import WAYS
 from bidnerf_core.localization import settings_of
 from bidnerf_core.registry import _declared
 from bombs import png_of
@@ -384,10 +384,9 @@ def test_what_is_missing_is_named(service: Service, inputs: Inputs) -> None:
 
 
 def test_messages_name_the_parameters_of_requests(tmp_path: Path) -> None:
-    for ways in (WAYS, WAYS_OF_PHOTO):
-        error = InputError("no focal length", where=tmp_path / "photo", expected=f"a camera: {ways}")
-        shown = public_message(error, tmp_path)
-        assert shown == "photo: no focal length, expected a camera: focal, hfov or camera"
+    error = InputError("no focal length", where=tmp_path / "photo", expected=f"a camera: {WAYS}")
+    shown = public_message(error, tmp_path)
+    assert shown == "photo: no focal length, expected a camera: camera (a file), focal (pixels) or hfov (degrees)"
 
 
 def test_requests_beyond_the_bound_are_turned_away(service: Service, inputs: Inputs) -> None:

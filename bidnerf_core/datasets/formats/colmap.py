@@ -70,7 +70,7 @@ def _read(path: Path, models: list[Path], options: DatasetOptions) -> Capture:
     """Read the project. Raises ``InputError`` if its model is damaged or has no registered image."""
     model, folder, images, cameras, files = colmap_project(path)
     if options.masks is None and any((each / "masks").is_dir() for each in (path, folder.parent)):
-        warn_about(path, "masks lies beside the images and is not used; name it (--masks, masks= in Python) to use it")
+        warn_about(path, "masks lies beside the images and is not used; name it (`masks`) to use it")
     if folder != path:
         photos = [file for file in folder.rglob("[!.]*") if file.suffix.lower() in IMAGE_ENDINGS[1:]]
         others = sorted(set(photos) - set(files.values()), key=lambda file: natural_order(str(file)))

@@ -64,7 +64,7 @@ class NerfstudioImporter:
             (data.parent if data.suffix == ".json" else data) if data is not None and placement.is_identity else None
         )
         if data is not None and photos is None:
-            told = "its photos are ignored, since their poses are not in the world of the map (--scale, --T-world-file)"
+            told = "its photos are ignored, since their poses are not in the world of the map (`scale`, `T_world_file`)"
         facts = (*found.found, frame, *([told] if told else []))
         up = torch.tensor(placed.rotation, dtype=torch.float64).reshape(3, 3).mT @ torch.tensor(UP, dtype=torch.float64)
         return replace(found, found=facts, photos=photos, up=(float(up[0]), float(up[1]), float(up[2])))
@@ -75,12 +75,12 @@ def _data(run: Run, config: ImportSettings) -> tuple[Path | None, str]:
     if config.data:
         given = Path(config.data)
         if not given.exists():
-            raise InputError("no such file or folder", where=given, expected="the dataset of the run (--data)")
+            raise InputError("no such file or folder", where=given, expected="the dataset of the run (`data`)")
         return given, ""
     named = run.data
     if named is None or not named.exists():
         where = "the config names no dataset" if named is None else f"its dataset {named} is no longer there"
-        return None, f"{where}: no photos for landmarks (--photos, or --data)"
+        return None, f"{where}: no photos for landmarks (`photos`, or `data`)"
     return named, ""
 
 

@@ -120,7 +120,7 @@ class Run:
         if data is None:
             return found, (
                 "poses will be in the coordinates of the original data, before any applied_transform: the"
-                " dataset is not where the config says (--data)"
+                " dataset is not where the config says (`data`)"
             )
         applied = _applied(data)
         told = "poses will be in the coordinates of the dataset"

@@ -94,14 +94,14 @@ def imported(
     if not scan.has_colours:
         facts.append(
             "no colours: it gives no landmarks, and poses are found from its shape alone, which needs"
-            " images with depth and is seldom accepted (--photos gives landmarks)"
+            " images with depth and is seldom accepted (`photos` gives landmarks)"
         )
     colours: Tensor | None = None
     if kept.faces is None:
         rgb = None if kept.rgb is None else torch.from_numpy(kept.rgb)
         few, rgb = thinned(points, rgb, config.points)
         if len(few) < len(points):
-            facts.append(f"thinned from {len(points):,} to {len(few):,} points (--points)")
+            facts.append(f"thinned from {len(points):,} to {len(few):,} points (`points`)")
         pieces = cloud_pieces(few, rgb)
         matter = few.float()
         colours = None if rgb is None else rgb.float()
@@ -190,7 +190,7 @@ def _check_precision(points: Float[Tensor, "n 3"], where: str, config: ScanSetti
         raise InputError(
             f"its coordinates are around ({x}, {y}, {z}), which single precision resolves only to {rounding:.2g};",
             where=where,
-            expected=f"a scan near the origin (--origin {x} {y} {z} makes that place the origin)",
+            expected=f"a scan near the origin (`origin` {x} {y} {z} makes that place the origin)",
         )
 
 
