@@ -6,9 +6,9 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
-from bidnerf.cli.options import Seed
+from bidnerf.cli.options import Overwrite, Seed, installed
 from bidnerf.cli.output import console, print_table, say, show
-from bidnerf.cli.parser import Flag, Option
+from bidnerf.cli.parser import Option
 from bidnerf.cli.running import interruptible_work
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.registry import USUAL_BACKEND
@@ -42,12 +42,12 @@ class DemoFrame(NamedTuple):
 
 
 def run_demo(
-    backend: Annotated[str, Option("NAME", "one of 'bidnerf backends'")] = USUAL_BACKEND,
+    backend: Annotated[str, installed("backends"), Option("NAME", "one of 'bidnerf backends'")] = USUAL_BACKEND,
     out: Annotated[Path, Option("DIR", "folder for the map, the images and the pictures")] = Path("demo-out"),
     frames: Annotated[int, WholeNumbers(1), Option("N", "number of unseen frames to localize")] = 4,
     steps: Annotated[int | None, WholeNumbers(1), Option("N", "training steps", "the backend's quick choice")] = None,
     seed: Seed = 0,
-    overwrite: Annotated[Flag, Option(None, "replace the contents of --out")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Train a map of a closed-form scene, and localize frames in it.
 

@@ -12,15 +12,19 @@ from urllib.parse import quote
 from bidnerf.cli.options import (
     TEST_IMAGES,
     Device,
-    Images,
+    Frames,
     Json,
     Localization,
     MethodOptions,
     Names,
+    NoDepth,
+    Overwrite,
+    SeenImages,
+    require_device,
     wrong_usage,
 )
 from bidnerf.cli.output import check_folder, console, print_json, require_outside_maps, say, show
-from bidnerf.cli.parser import Flag, Group, Option, Without
+from bidnerf.cli.parser import Group, Option, Without
 from bidnerf.cli.running import display_progress, interruptible_work
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, amount
@@ -35,7 +39,7 @@ class TrialOptions:
     """Which frames are tried, and from which starts."""
 
     protocol: Annotated[
-        str | None,
+        Literal["bid", "bid-hard", "inerf", "perturb", "none"] | None,
         Option(
             "NAME",
             "how starts are chosen: bid, bid-hard, inerf, perturb or none",
@@ -44,7 +48,11 @@ class TrialOptions:
     ] = None
     size: Annotated[
         tuple[str, ...],
-        Option("SIZE...", "error of the start: e_t, or METRES:DEGREES for perturb", "the protocol's"),
+        Option(
+            "SIZE...",
+            "error of the start: metres for bid and bid-hard (e_t of that paper), METRES:DEGREES for perturb",
+            "the protocol's",
+        ),
     ] = ()
     trials: Annotated[
         int | None,
@@ -54,7 +62,7 @@ class TrialOptions:
     seed: Annotated[
         int | None, WholeNumbers(0, LARGEST_SEED), Option("N", "seed of every random choice", "the protocol's")
     ] = None
-    frame: Annotated[Names, Option("NAME...", "try only these frames", "all of the split")] = ()
+    frame: Frames = ()
 
     def plan(self, method: MethodOptions, images: DatasetOptions, **more: Any) -> Plan:
         """Return the plan of the trials; ``more`` holds the fields of the plan that these options do not set."""
@@ -88,7 +96,7 @@ Starts: TypeAlias = Annotated[TrialOptions, Group("starts", "Which frames are tr
 class InputOptions:
     """What the method receives."""
 
-    depth: Annotated[bool, Option(None, "use measured depth if available")] = True
+    no_depth: NoDepth = False
     fault: Annotated[
         Names,
         Option(
@@ -126,8 +134,9 @@ def run_evaluate(
     starts: Starts,
     input: Annotated[InputOptions, Group("input", "What the method receives of each frame.")],
     work: Annotated[WorkOptions, Group("work", "Where the trials are run.")],
-    images: Annotated[Images, Without("largest", "background")] = TEST_IMAGES,
+    images: SeenImages = TEST_IMAGES,
     method: Localization,
+    json: Json = False,
 ) -> None:
     """Localize many frames of a dataset, and write one JSON line a trial.
 
@@ -144,14 +153,18 @@ def run_evaluate(
         method,
         images,
         device=work.device,
-        depth=input.depth,
+        depth=not input.no_depth,
         faults=input.fault,
         shard=work.shard,
         shards=work.shards,
     )
+    require_device(work.device)
     require_outside_maps(out.parent, out)
     with interruptible_work("waiting for the trials under way (Ctrl-C again: at once)"):
         table = evaluate(map, data or map, plan, out=out, workers=work.dask or work.workers)
+    if json:
+        print_json([row.plain() for row in table.rows])
+        return
     show(f"{amount(len(table.rows), 'trial')} in {out}; 'bidnerf report {out}' shows them")
 
 
@@ -163,17 +176,22 @@ def run_compare(
             "folders of maps, followed by the folder of a dataset of the same scene",
             positional=True,
         ),
-    ] = (),
+    ],
     out: Annotated[Path | None, Option("DIR", "write compare.json, compare.png and compare.svg there")] = None,
     size: Annotated[
         str | None,
-        Option("SIZE", "error of the start: e_t, or METRES:DEGREES for perturb", "the protocol's first"),
+        Option(
+            "SIZE",
+            "error of the start: metres for bid and bid-hard (e_t of that paper), METRES:DEGREES for perturb",
+            "the protocol's first",
+        ),
     ] = None,
     *,
     starts: Annotated[Starts, Without("size")],
     json: Json = False,
-    overwrite: Annotated[Flag, Option(None, "replace the contents of --out")] = False,
-    images: Annotated[Images, Without("largest", "background")] = TEST_IMAGES,
+    overwrite: Overwrite = False,
+    device: Device = "cpu",
+    images: SeenImages = TEST_IMAGES,
     method: Localization,
 ) -> None:
     """Localize the same frames in several maps, and compare the results.
@@ -181,16 +199,17 @@ def run_compare(
     The starts are the same; success, steps, time and memory are compared. Each map has its own process, and the maps take turns at
     each start.
     """
-    from bidnerf.evaluation import compare, comparison_figure
-    from bidnerf_core.io import output_folder, to_plain
-
     if len(folders) < 2:
         raise UsageError(
             f"{len(folders)} folder{'s' if len(folders) != 1 else ''} given",
             expected="the folders of one or more maps, then that of a dataset",
         )
+    from bidnerf.evaluation import compare, comparison_figure
+    from bidnerf_core.io import output_folder, to_plain
+
     *maps, data = folders
-    plan = replace(starts, size=() if size is None else (size,)).plan(method, images)
+    require_device(device)
+    plan = replace(starts, size=() if size is None else (size,)).plan(method, images, device=device)
     if out is not None:
         check_folder(out, folders)
     with nullcontext() if out is None else output_folder(out, overwrite), display_progress():
@@ -209,9 +228,7 @@ def run_compare(
 
 
 def run_report(
-    results: Annotated[
-        tuple[Path, ...], Option("RESULTS...", "files written by 'bidnerf evaluate'", positional=True)
-    ] = (),
+    results: Annotated[tuple[Path, ...], Option("RESULTS...", "files written by 'bidnerf evaluate'", positional=True)],
     out: Annotated[Path, Option("DIR", "folder for index.html and the figures as PNG and SVG")] = Path("report"),
     criterion: Annotated[
         Literal["10%", "5deg 0.05", "1deg 0.02"] | None,
@@ -234,8 +251,6 @@ def run_report(
     # Imported when a report is made, since help pages do not need it.
     from bidnerf.evaluation import ResultTable, choose_criterion, read_runs, write_report
 
-    if not results:
-        raise UsageError("no results file", expected="at least one written by 'bidnerf evaluate'")
     table = ResultTable.load(*results)
     with wrong_usage():
         chosen = choose_criterion(criterion, table.groups)

@@ -12,21 +12,25 @@ from typing import TYPE_CHECKING, Annotated
 
 from bidnerf.cli.options import (
     TEST_IMAGES,
-    Images,
+    Device,
     Json,
     Localization,
     MapFolder,
+    Overwrite,
     Queries,
     Seed,
+    SeenImages,
     pose_file_help,
     refuse,
+    require_device,
     require_one,
+    wrong_usage,
 )
 from bidnerf.cli.output import check_folder, check_output, print_json, say, show
-from bidnerf.cli.parser import Group, Option, Without
+from bidnerf.cli.parser import Group, Option
 from bidnerf.cli.running import display_progress
 from bidnerf.cli.signals import defer_interruptions
-from bidnerf_core.errors import InputError, UsageError, amount, enumeration
+from bidnerf_core.errors import InputError, UsageError, amount, enumeration, errors_in
 
 if TYPE_CHECKING:
     from bidnerf.results import Answer, Answers, Failure
@@ -65,10 +69,8 @@ class StartOptions:
 
         start, moved = self.start, self.perturb
         if moved is not None:
-            try:
+            with wrong_usage(), errors_in("--perturb"):
                 find_protocol("perturb").check_size(moved)
-            except InputError as error:
-                raise UsageError(error, where="--perturb") from error
         poses = None if start is None else read_poses(start)
 
         numbers = itertools.count(seed)
@@ -90,6 +92,7 @@ class AnswerOutput:
 
     out: Annotated[Path | None, Option("POSES", pose_file_help)] = None
     draw: Annotated[Path | None, Option("DIR", "draw each photo next to the map rendered from the pose found")] = None
+    overwrite: Overwrite = False
     json: Json = False
 
     def check(self, inputs: Sequence[Path]) -> None:
@@ -98,7 +101,7 @@ class AnswerOutput:
 
         if self.out is not None:
             check_pose_file(self.out)
-            check_output(self.out, inputs)
+            check_output(self.out, inputs, self.overwrite)
         if self.draw is not None:
             check_folder(self.draw, inputs, create=True)
 
@@ -118,19 +121,20 @@ def run_localize(
             " image is localized in the one it shows",
             positional=True,
         ),
-    ] = (),
+    ],
     *,
     output: Annotated[AnswerOutput, Group("output", "What is written beside the lines on standard output.")],
     queries: Queries,
-    images: Annotated[Images, Without("largest", "background")] = TEST_IMAGES,
+    images: SeenImages = TEST_IMAGES,
     start: Annotated[StartOptions, Group("start", "Where localization starts. By default, it needs no start.")],
     method: Localization,
+    device: Device = "cpu",
     seed: Seed = 0,
 ) -> None:
     """Find the poses of photos, or of a dataset's frames, in a map.
 
     If several maps are given, each image is localized in the one that it shows. QUERY is image files, folders of photos, or a dataset. A photo's camera comes from its EXIF unless it is given; if EXIF has no
-    focal length, method auto begins with the camera of the map's images. Dataset frames named by --frame form a rig: their
+    focal length, method auto begins with the camera of the map's images. With --rig, the frames in --frame form a rig: their
     relative poses come from the dataset, and the pose found is that of the last one's camera. Poses are camera to world with
     OpenCV axes (x right, y down, z forward).
     """
@@ -151,18 +155,20 @@ def run_localize(
         expected = "MAP first, then image files, folders of photos, or a folder of a dataset"
         raise UsageError(f"no QUERY after {named};", expected=expected)
     start_of = start.of_queries(seed)
-    require_start(method.method, start.start is not None or start.perturb is not None)
+    with wrong_usage():
+        require_start(method.method, start.start is not None or start.perturb is not None)
+    require_device(device)
     files = (*paths, *queries.depth, start.start, images.camera, images.register_depth)
     inputs = [Path(file) for file in files if isinstance(file, str | Path)]
     output.check(inputs)
     if len(maps) > 1 or maps_in(map) not in ([], [map]):
         _check_for_several(output, start)
         with display_progress():
-            collection = MapCollection(maps, method.method, method.config)
+            collection = MapCollection(maps, method.method, method.config, device=device)
         finder: Localizer | MapCollection = collection
         answers, source = Answers(collection), queries.open(paths, images, collection.cameras)
     else:
-        scene = load_map(map)
+        scene = load_map(map, device)
         cameras = landmark_cameras(scene) if matches_landmarks(method.method, method.config) else ()
         source = queries.open(paths, images, cameras, scene.bounds.background)
         answers = Answers(scene)
@@ -171,7 +177,7 @@ def run_localize(
         raise UsageError("--perturb moves the true pose, which photos do not have;", expected="--start")
     if output.draw is not None:
         for name in source.names:
-            check_output(output.picture(name), inputs)
+            check_output(output.picture(name), inputs, output.overwrite)
     shown = Run(output, answers, len(source.names), start_of)
     with display_progress(), shown.save_at_end():
         localize_each(finder, source, start=start_of, seed=seed, answers=answers, each=shown.show)

@@ -11,19 +11,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 from bidnerf.cli.options import (
     TEST_IMAGES,
     BakeSettings,
+    ColourImages,
     Device,
-    Images,
+    Frames,
     Json,
     MapFolder,
-    Names,
+    MappedImages,
     NewMap,
-    list_names,
+    Overwrite,
+    WholeImages,
+    installed,
     refuse,
+    require_device,
     require_one,
-    wrong_usage,
 )
 from bidnerf.cli.output import check_folder, check_output, print_json, say, show
-from bidnerf.cli.parser import Flag, Group, Option, SettingsGroup, Without
+from bidnerf.cli.parser import Flag, Group, Option, SettingsGroup
 from bidnerf.cli.running import display_progress, interruptible_work
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.progress import counter
@@ -40,20 +43,20 @@ def run_info(
     map: MapFolder,
     json: Json = False,
     draw: Annotated[Path | None, Option("PNG", "file for a picture of the capture from above", "no picture")] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Describe a map and the photos it was built from.
 
     The whole map is loaded, so that damage is detected.
     """
+    if draw is not None:
+        if draw.suffix.lower() != ".png":
+            raise UsageError(where=draw, expected="the name of a PNG file")
+        check_output(draw, (), overwrite)
     from bidnerf.results import draw_capture
     from bidnerf_core.maps import load_map
 
-    if draw is not None:
-        if draw.suffix.lower() != ".png":
-            raise InputError(where=draw, expected="the name of a PNG file")
-        check_output(draw, ())
     scene = load_map(map)
-    summary = scene.describe()
     if draw is not None:
         if scene.capture is None:
             raise InputError(
@@ -64,9 +67,9 @@ def run_info(
         draw_capture(scene.capture, points, seen_by, draw, scene.unit)
         say(f"{draw}: written")
     if json:
-        print_json(summary.plain())
+        print_json(scene.describe().plain())
         return
-    for line in str(summary).splitlines():
+    for line in str(scene.describe()).splitlines():
         show(line)
 
 
@@ -74,13 +77,17 @@ def run_export(
     map: MapFolder,
     to: Annotated[
         str,
+        installed("exporters"),
         Option(
             "FORMAT",
-            lambda: f"format of the files, one of 'bidnerf plugins exporters': {list_names('exporters')}",
+            lambda: (
+                "format of the files, one of 'bidnerf plugins exporters': " + ", ".join(installed("exporters").table)
+            ),
         ),
     ],
     out: Annotated[Path, Option("DIR", "folder for the files")],
-    overwrite: Annotated[Flag, Option(None, "write into a non-empty folder")] = False,
+    overwrite: Overwrite = False,
+    json: Json = False,
 ) -> None:
     """Export a map's surface, landmarks and cameras for other software.
 
@@ -89,7 +96,11 @@ def run_export(
     from bidnerf.results import export_map
 
     check_folder(out, (map,))
-    for file in export_map(map, out, to, overwrite):
+    files = export_map(map, out, to, overwrite)
+    if json:
+        print_json([{"file": str(file), "bytes": file.stat().st_size} for file in files])
+        return
+    for file in files:
         show(f"{file}: {file.stat().st_size / 1e6:.2f} MB")
 
 
@@ -111,10 +122,11 @@ def run_scale(
         ),
     ] = None,
     factor: Annotated[
-        float | None, Option("F", "metres per unit of the map; 1 states that its unit is the metre")
+        float | None, Above(0.0), Option("F", "metres per unit of the map; 1 states that its unit is the metre")
     ] = None,
     out: Annotated[Path | None, Option("MAP2", "leave the map unchanged and write a new one")] = None,
-    overwrite: Annotated[Flag, Option(None, "replace the map in --out")] = False,
+    overwrite: Overwrite = False,
+    json: Json = False,
 ) -> None:
     """Convert a map to metres.
 
@@ -144,6 +156,9 @@ def run_scale(
             factor = factor_of_distance(scene, first, second, metres)
         assert factor is not None
         stored = scene.scaled(factor).write_to(out or map)
+    if json:
+        print_json(stored.describe().plain())
+        return
     sides = " x ".join(f"{side:.3g}" for side in stored.bounds.size)
     show(f"{out or map}: all lengths multiplied by {factor:.6g}; the scene is now in metres, in a box of {sides}")
 
@@ -152,13 +167,15 @@ def run_render(
     map: MapFolder,
     data: Annotated[Path, Option("DATA", "folder of a dataset, or a .r3d file", positional=True)],
     out: Annotated[Path, Option("DIR", "folder for the images")],
-    frame: Annotated[Names, Option("NAME...", "render only these frames", "all of the split")] = (),
+    frame: Frames = (),
     level: Annotated[
         int | None, EXPERT, Option("N", "level of detail, 0 the coarsest", "the field itself, the finest")
     ] = None,
-    overwrite: Annotated[Flag, Option(None, "replace images in --out")] = False,
+    overwrite: Overwrite = False,
+    device: Device = "cpu",
+    json: Json = False,
     *,
-    images: Annotated[Images, Without("masks", "mask_hides", "largest", "background")] = TEST_IMAGES,
+    images: WholeImages = TEST_IMAGES,
 ) -> None:
     """Render a map from the poses of a dataset.
 
@@ -169,12 +186,13 @@ def run_render(
     from bidnerf_core.maps import load_info, load_map
 
     check_folder(out, (map, data))
+    require_device(device)
     with output_folder(out, overwrite), display_progress():
         dataset = replace(images, background=load_info(map).bounds.background).open(data)
         names = list(frame) or dataset.frame_names(images.split)
         if not names:
             raise InputError(f"split {images.split!r} has no frames", where=data)
-        scene = load_map(map)
+        scene = load_map(map, device)
         views = dataset.views(images.split, names)
         names = [view.frame.name for view in views]
         for name in {f"{name}.depth" for name in names} & set(names):
@@ -182,10 +200,10 @@ def run_render(
                 f"frame {name!r} would overwrite the depth of {name.removesuffix('.depth')!r}; render them one by one"
                 " with --frame, into different folders"
             )
-        _render_views(scene, level, views, out)
+        _render_views(scene, level, views, out, json)
 
 
-def _render_views(scene: Map, level: int | None, views: Sequence[View], out: Path) -> None:
+def _render_views(scene: Map, level: int | None, views: Sequence[View], out: Path, json: bool) -> None:
     import torch
 
     from bidnerf_core.geometry import symbol
@@ -196,8 +214,13 @@ def _render_views(scene: Map, level: int | None, views: Sequence[View], out: Pat
         image = scene.render(view, level)
         write_images(out, view.frame.name, image)
         scores.append(rendering_scores(image, view.frame, scene.unit))
-        show(f"{view.frame.name}  {scores[-1]}")
+        if json:
+            print_json({"frame": view.frame.name, "psnr": scores[-1].psnr, "depth_error": scores[-1].depth_error})
+        else:
+            show(f"{view.frame.name}  {scores[-1]}")
         count(number + 1, len(views))
+    if json:
+        return
     errors = torch.cat([score.depth_errors for score in scores])
     mean = RenderingScores(statistics.fmean(score.psnr for score in scores), errors, scene.unit)
     error = "-" if mean.depth_error is None else f"{mean.depth_error:.4f}"
@@ -238,11 +261,13 @@ def run_bake(
     landmark_features: Annotated[
         str | None,
         EXPERT,
+        installed("features"),
         Option("NAME", "detector of the landmarks, one of 'bidnerf plugins features'", "the map's"),
     ] = None,
     device: Device = "cpu",
+    json: Json = False,
     *,
-    images: Annotated[Images, Without("background")],
+    images: MappedImages,
     config: BakeSettings = None,
 ) -> None:
     """Find the surface and the landmarks of a map, and store them in it.
@@ -252,19 +277,21 @@ def run_bake(
     from images rendered by the field, which are only as sharp as the field. Landmarks from photos are kept unless --data gives
     new photos or --rendered-landmarks is set.
     """
-    from bidnerf_core.mapping import find_features
     from bidnerf_core.maps import load_map
 
     if rendered_landmarks:
         refuse({"--data": data}, "gives photos, but --rendered-landmarks uses none;", expected="only one of them")
     if data is None:
         refuse({"--masks": images.masks}, "was given without --data", expected="the dataset that they belong to")
-    if landmark_features is not None:
-        find_features(landmark_features)
+    require_device(device)
     # The baked parts may be damaged, so they are not loaded here.
     scene = load_map(map, device, baked=False)
     with interruptible_work():
-        scene.bake(data, config, images=images, rendered_landmarks=rendered_landmarks, features=landmark_features)
+        scene = scene.bake(
+            data, config, images=images, rendered_landmarks=rendered_landmarks, features=landmark_features
+        )
+    if json:
+        print_json(scene.describe().plain())
 
 
 def run_extend(
@@ -282,8 +309,10 @@ def run_extend(
         WholeNumbers(1),
         Option("N", "training steps", "in proportion to the new photos, at least a quarter of the usual number"),
     ] = None,
+    device: Device = "cpu",
+    json: Json = False,
     *,
-    images: Annotated[Images, Without("masks", "mask_hides", "largest", "background")],
+    images: WholeImages,
     config: BakeSettings = None,
 ) -> None:
     """Add photos of the same scene to a map.
@@ -295,6 +324,7 @@ def run_extend(
     from bidnerf_core.datasets import find_reader
     from bidnerf_core.maps import extend, load_info
 
+    require_device(device)
     info = load_info(map)
     given = {"--camera": images.camera, "--register-depth": images.register_depth, "--depth-unit": images.depth_unit}
     is_stated = any(value is not None for value in given.values())
@@ -306,7 +336,10 @@ def run_extend(
     opened: dict[Path, Path | Capture] = {path: options.open(path) for path in datasets}
     known = None if data is None else opened.get(data, data)
     with interruptible_work():
-        scene = extend(map, opened.get(new, new), known, split=images.split, steps=steps, config=config)
+        scene = extend(map, opened.get(new, new), known, split=images.split, steps=steps, config=config, device=device)
+    if json:
+        print_json(scene.describe().plain())
+        return
     added, total = len(scene.info.cameras) - len(info.cameras), len(scene.info.cameras)
     show(f"{map}: {amount(added, 'photo')} added, {amount(total, 'image')} in all")
 
@@ -315,9 +348,8 @@ def _importer_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
     """Return the default settings of the importer that the arguments select, or None if they select none."""
     from bidnerf_core.maps import IMPORTERS, importer_of
 
-    if values["as_"] is not None:
-        with wrong_usage():
-            return IMPORTERS.load(values["as_"]).config_type()
+    if values["importer"] is not None:
+        return IMPORTERS.load(values["importer"]).config_type()
     for word in words:
         try:
             if not word.startswith("-"):
@@ -345,9 +377,12 @@ def run_import(
         Option("FILE", "file or folder of a trained field, or folder of a COLMAP project", positional=True),
     ],
     out: Annotated[Path, Option("MAP", "folder for the map")],
-    as_: Annotated[
-        str | None, Option("NAME", "one of 'bidnerf plugins importers'", "the one that recognizes the file")
+    importer: Annotated[
+        str | None,
+        installed("importers"),
+        Option("NAME", "one of 'bidnerf plugins importers'", "the one that recognizes the file"),
     ] = None,
+    json: Json = False,
     *,
     world: Annotated[WorldOptions, Group("world", "How the coordinates of the file become those of the map.")],
     photos: Annotated[
@@ -355,10 +390,7 @@ def run_import(
         Option("DATA", "dataset whose photos, with poses in the world, provide the landmarks", "rendered images"),
     ] = None,
     target: NewMap,
-    images: Annotated[
-        Images,
-        Without("register_depth", "depth_unit", "masks", "mask_hides", "largest", "background"),
-    ],
+    images: ColourImages,
     config: Annotated[
         Any,
         SettingsGroup("settings of the importer", "What the importer cannot find in the file.", _importer_settings),
@@ -374,15 +406,17 @@ def run_import(
     world; its files are not changed. Such a map localizes photos without a field, which 'bidnerf train FILE --out MAP' adds.
     """
     from bidnerf.results import read_pose
-    from bidnerf_core.devices import working_device
     from bidnerf_core.maps import ImportOptions, import_map
 
     check_folder(out, (file, photos), may_be_map=True)
-    working_device(target.device)
+    require_device(target.device)
     pose = None
     if world.T_world_file is not None:
-        with wrong_usage():
-            pose = read_pose(world.T_world_file)
-    options = ImportOptions(images, target.landmark_features, target.device, target.overwrite, as_, world.scale, pose)
+        pose = read_pose(world.T_world_file)
+    options = ImportOptions(
+        images, target.landmark_features, target.device, target.overwrite, importer, world.scale, pose
+    )
     with interruptible_work():
-        import_map(file, out, config, photos=photos, bake=not target.no_bake, options=options)
+        scene = import_map(file, out, config, photos=photos, bake=not target.no_bake, options=options)
+    if json:
+        print_json(scene.describe().plain())

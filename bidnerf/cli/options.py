@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
-from bidnerf.cli.parser import FLAG, Group, Option, SettingsGroup, as_usage_error
+from bidnerf.cli.parser import FLAG, Group, Option, SettingsGroup, Without, as_usage_error
 from bidnerf_core import datasets, mapping
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
-from bidnerf_core.registry import USUAL_FEATURES, USUAL_METHOD, list_plugins
-from bidnerf_core.settings import EXPERT, LARGEST_SEED, WholeNumbers
+from bidnerf_core.registry import USUAL_FEATURES, USUAL_METHOD, Plugins
+from bidnerf_core.settings import EXPERT, LARGEST_SEED, Above, OneOf, WholeNumbers
 
 if TYPE_CHECKING:
     from bidnerf_core.camera import CameraSource, Intrinsics
@@ -23,9 +23,12 @@ if TYPE_CHECKING:
 TEST_IMAGES = DatasetOptions(split="test")
 """The default options for images with which a map is tested."""
 Images: TypeAlias = Annotated[DatasetOptions, Group("images", "How the images and their depth are read.")]
+MappedImages: TypeAlias = Annotated[Images, Without("background")]  # in the map, which has a background
+SeenImages: TypeAlias = Annotated[MappedImages, Without("largest")]  # localized at the size that the method chooses
+WholeImages: TypeAlias = Annotated[SeenImages, Without("masks", "mask_hides")]  # of which every pixel counts
+ColourImages: TypeAlias = Annotated[WholeImages, Without("register_depth", "depth_unit")]  # whose depth is not used
 
 MapFolder: TypeAlias = Annotated[Path, Option("MAP", "folder of a map, as written by 'bidnerf train'", positional=True)]
-Method: TypeAlias = Annotated[str, Option("NAME", "method that finds poses, one of 'bidnerf plugins methods'")]
 Device: TypeAlias = Annotated[str, Option("NAME", "device on which the field computes: cpu, cuda ...")]
 Host: TypeAlias = Annotated[
     str | None,
@@ -34,7 +37,9 @@ Host: TypeAlias = Annotated[
 Port: TypeAlias = Annotated[int, WholeNumbers(0, 65535), Option("N", "port to listen on; 0 picks a free one")]
 Seed: TypeAlias = Annotated[int, WholeNumbers(0, LARGEST_SEED), Option("N", "seed of every random choice")]
 Json: TypeAlias = Annotated[bool, FLAG, Option(None, "print JSON: one value on a line")]
+NoDepth: TypeAlias = Annotated[bool, FLAG, Option(None, "leave out measured depth")]
 Names: TypeAlias = tuple[str, ...]
+Frames: TypeAlias = Annotated[Names, Option("NAME...", "use only these frames of a dataset", "all of the split")]
 
 
 BakeSettings: TypeAlias = Annotated[
@@ -55,14 +60,21 @@ PointChoice: TypeAlias = Annotated[
 ]
 
 
-def list_names(group: str) -> str:
-    """Return the names of a group's plugins for a help text; nothing is imported."""
-    return ", ".join(dict.fromkeys(info.name for info in list_plugins(group)))
+def installed(group: str) -> OneOf:
+    """Return the names of the plugins of a group as the values of an option; nothing is imported."""
+    return OneOf(Plugins(group, lambda _: iter(())))
 
 
 def pose_file_help() -> str:
     """Return the help text of an option that names a pose file."""
-    return f"write the poses to this file, in the format of its ending: {list_names('writers')}; .json has all details"
+    names = ", ".join(installed("writers").table)
+    return f"write the poses to this file, in the format of its ending: {names}; .json has all details"
+
+
+Method: TypeAlias = Annotated[
+    str, installed("methods"), Option("NAME", "method that finds poses, one of 'bidnerf plugins methods'")
+]
+Overwrite: TypeAlias = Annotated[bool, FLAG, Option(None, "replace output that exists")]
 
 
 def _method_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
@@ -95,10 +107,13 @@ Localization: TypeAlias = Annotated[MethodOptions, Group("localization", "How po
 class MapOutput:
     """The map that is written, and its landmarks."""
 
-    overwrite: Annotated[bool, FLAG, Option(None, "replace the map in --out")] = False
+    overwrite: Overwrite = False
     no_bake: Annotated[bool, FLAG, EXPERT, Option(None, "leave the surface and landmarks to 'bidnerf bake'")] = False
     landmark_features: Annotated[
-        str, EXPERT, Option("NAME", "detector of the landmarks, one of 'bidnerf plugins features'")
+        str,
+        EXPERT,
+        installed("features"),
+        Option("NAME", "detector of the landmarks, one of 'bidnerf plugins features'"),
     ] = USUAL_FEATURES
     device: Device = "cpu"
 
@@ -122,6 +137,14 @@ def refuse(options: Mapping[str, object], reason: str, expected: str | None = No
             raise UsageError(f"{option} {reason}", expected=expected)
 
 
+def require_device(device: str) -> None:
+    """Raise ``UsageError`` if a device does not work here."""
+    from bidnerf_core.devices import working_device
+
+    with wrong_usage():
+        working_device(device)
+
+
 @contextlib.contextmanager
 def wrong_usage() -> Iterator[None]:
     """Convert an ``InputError`` in the block to ``UsageError``, for arguments that are wrong whatever files contain."""
@@ -135,24 +158,29 @@ def wrong_usage() -> Iterator[None]:
 class CameraOptions:
     """The camera of images whose format stores none."""
 
-    focal: Annotated[float | None, Option("PX", "focal length in pixels of the image file")] = None
-    hfov: Annotated[float | None, Option("DEG", "horizontal field of view of the upright image")] = None
+    focal: Annotated[float | None, Above(0.0), Option("PX", "focal length in pixels of the image file")] = None
+    hfov: Annotated[float | None, Above(0.0, 179.0), Option("DEG", "horizontal field of view of the upright image")] = (
+        None
+    )
 
     def __post_init__(self) -> None:
         require_one({"--focal": self.focal, "--hfov": self.hfov})
 
-    def source(self, images: DatasetOptions, assumed: Sequence[Intrinsics] = ()) -> CameraSource:
-        """Return the camera source for single images, where ``assumed`` are candidates for unknown cameras."""
+    def source(self, camera: Any, assumed: Sequence[Intrinsics] = ()) -> CameraSource:
+        """Return the camera source for single images: ``camera``, these options or, if unknown, the ``assumed`` cameras."""
         from bidnerf_core.camera import CameraSource
 
-        require_one({"--camera": images.camera, "--focal": self.focal, "--hfov": self.hfov})
-        assert images.camera is None or isinstance(images.camera, str | Path)
-        return CameraSource(images.camera, self.focal, self.hfov, tuple(assumed))
+        require_one({"--camera": camera, "--focal": self.focal, "--hfov": self.hfov})
+        return CameraSource(camera, self.focal, self.hfov, tuple(assumed))
 
 
 CameraGroup: TypeAlias = Annotated[
     CameraOptions,
     Group("camera", "The camera of photos without one of their own. By default, it comes from EXIF or from the map."),
+]
+NewCameraGroup: TypeAlias = Annotated[
+    CameraOptions,
+    Group("camera", "The camera of photos without poses. By default, it is estimated, starting from EXIF."),
 ]
 
 
@@ -164,10 +192,8 @@ class QueryOptions:
         tuple[Path, ...],
         Option("FILE...", "depth images or .npy files of the photos, in the same order, or matched by name"),
     ] = ()
-    frame: Annotated[
-        Names,
-        Option("NAME...", "frames of a dataset, together as a rig", "each frame of the split on its own"),
-    ] = ()
+    frame: Frames = ()
+    rig: Annotated[bool, FLAG, Option(None, "find one pose for the frames in --frame, together as a rig")] = False
     window: Annotated[
         int,
         WholeNumbers(1),
@@ -179,10 +205,10 @@ class QueryOptions:
         twice = next((name for name in self.frame if self.frame.count(name) > 1), None)
         if twice is not None:
             raise UsageError(f"--frame names {twice} more than once", expected="each once")
-        if self.window > 1 and len(self.frame) > 1:
-            raise UsageError(
-                f"--window {self.window} with {len(self.frame)} frames", expected="one: the last of the window"
-            )
+        if self.rig and not self.frame:
+            raise UsageError("--rig was given without --frame", expected="the frames of the rig")
+        if self.rig and self.window > 1:
+            raise UsageError("--rig and --window exclude each other", expected="only one of them")
 
     def open(
         self,
@@ -208,14 +234,14 @@ class QueryOptions:
                 f"is for photos, but {paths[0]} is a dataset, which has its own; to use its images as photos, name the files",
             )
             dataset = replace(images, background=background).open(paths[0])
-            return DatasetFrames(dataset, images.split, self.frame, self.window)
+            return DatasetFrames(dataset, images.split, self.frame, self.window, self.rig)
         if self.window > 1:
             raise UsageError(f"--window {self.window} needs known relative poses", expected="a dataset")
         files = photo_files(paths, self.depth)
         if not self.depth:
             of_depth = {"--depth-unit": images.depth_unit, "--register-depth": images.registration or None}
             refuse(of_depth, "was given without --depth", expected="the depth image that it belongs to")
-        options = replace(images, camera=self.camera.source(images, assumed), background=background)
+        options = replace(images, camera=self.camera.source(images.camera, assumed), background=background)
         return Photos(files, options, depth_files(files, self.depth))
 
 

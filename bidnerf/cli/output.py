@@ -60,12 +60,12 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], wide: str
 # Files and folders are checked before any work, and never replace an input.
 
 
-def check_output(out: Path, inputs: Iterable[Path | str | None]) -> None:
+def check_output(out: Path, inputs: Iterable[Path | str | None], overwrite: bool) -> None:
     """Raise an error, before any work is done, if the file ``out`` cannot be written or would replace an input.
 
     Inputs are the files of any map, the ``inputs``, and the files in folders among the ``inputs``. Raises
-    ``UsageError`` if ``out`` would replace an input, and ``InputError`` if ``out`` is a folder, or if its folder does
-    not exist or is not writable.
+    ``UsageError`` if ``out`` would replace an input, and ``InputError`` if ``out`` is a folder, if its folder does
+    not exist or is not writable, or if ``out`` exists and ``overwrite`` is not set.
     """
     # os.path functions return False for a name that is too long, which is reported when it is written.
     if os.path.isdir(out) or not os.path.isdir(out.parent):
@@ -82,6 +82,8 @@ def check_output(out: Path, inputs: Iterable[Path | str | None]) -> None:
             raise UsageError(
                 f"is a file in the input {given};", where=out, expected="a new name, or remove the file first"
             )
+    if not overwrite:
+        raise InputError("exists already; name another file, or overwrite it (`overwrite`)", where=out)
 
 
 def check_folder(

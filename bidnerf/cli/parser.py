@@ -27,7 +27,7 @@ from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
 from bidnerf.cli.program import option_name
 from bidnerf_core.errors import InputError, UsageError, enumeration, spelling_hint
-from bidnerf_core.settings import Allowed, Expert
+from bidnerf_core.settings import Allowed, Expert, OneOf
 
 T = TypeVar("T")
 
@@ -120,7 +120,7 @@ class Parameter:
     @property
     def left_out(self) -> frozenset[str]:
         """The fields that are not options, if the parameter is a dataclass."""
-        return self.note(Without) or frozenset()
+        return frozenset(name for note in self.notes if isinstance(note, Without) for name in note)
 
     @property
     def description(self) -> str:
@@ -152,10 +152,9 @@ def parse(command: str, target: Callable[..., T], arguments: Sequence[str]) -> T
     if pending:
         first = _Parser(command, target, {}, options_only=True)
         given = vars(first.parse_known_args(_escape(words))[0])
+        if not pages and first.unknown_option(words) is None:  # else it may be one of the settings
+            _Parser(command, target, {}).parse_all(words)  # refuses what is missing before settings are loaded
         values = {p.name: p.default for p, _ in _leaves(target, {})} | given
-        missing = [p.flag for p, _ in _leaves(target, {}) if values[p.name] is MISSING and not p.option.positional]
-        if missing and not pages and first.unknown_option(words) is None:
-            first.error(f"the following arguments are required: {', '.join(missing)}")
         loaded = {name: note.load(values, words) for name, note in pending.items()}
     parser = _Parser(command, target, loaded)
     if pages:
@@ -305,9 +304,14 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Raise ``UsageError``. An unknown option is reported instead of ``message``, since it explains the other errors."""
-        message = re.sub(r"^argument (\S+): ", r"\1 ", message)
-        if (name := self.unknown_option(getattr(self, "_words", ()))) is not None:
-            message = f"no option {name!r}{spelling_hint(name, self._option_string_actions)}"
+        words, options = getattr(self, "_words", ()), self._option_string_actions
+        message = re.sub(r"^argument \[?([^]: ]+)\S*: ", r"\1 ", message)
+        if (name := self.unknown_option(words)) is not None:
+            message = f"no option {name!r}{spelling_hint(name, options)}"
+        elif message.startswith("the following") and (
+            lists := [w for w in words if w in options and options[w].nargs == "+"]
+        ):
+            message = f"{message}; {lists[-1]} takes all words after it, so give it last"
         raise UsageError(f"{message}; '{self.prog} {HELP}' describes all arguments")
 
 
@@ -432,10 +436,10 @@ def conversion(hint: Any, notes: Sequence[Any] = ()) -> tuple[int | str | None, 
                 continue
             if isinstance(value, float) and not math.isfinite(value):
                 continue
-            for limit in limits:
-                if value not in limit:
-                    raise argparse.ArgumentTypeError(f"is {value!r}, expected {limit}")
+            for limit in (limit for limit in limits if value not in limit):
+                hint = spelling_hint(word, [*map(str, limit.table)]) if isinstance(limit, OneOf) else ""
+                raise argparse.ArgumentTypeError(f"is {value!r}{hint or f', expected {limit}'}")
             return value
-        raise argparse.ArgumentTypeError(f"is {word!r}, expected {expected}")
+        raise argparse.ArgumentTypeError(f"is {word!r}{spelling_hint(word, choices, f', expected {expected}')}")
 
     return None, convert_word, metavar

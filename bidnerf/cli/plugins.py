@@ -8,11 +8,13 @@ from bidnerf.cli.options import Json
 from bidnerf.cli.output import print_json, print_table
 from bidnerf.cli.parser import Option
 from bidnerf_core.registry import GROUPS, PluginInfo, list_plugins
+from bidnerf_core.settings import OneOf
 
 
 def run_plugins(
     group: Annotated[
         str | None,
+        OneOf(GROUPS),
         Option("[GROUP]", f"one kind of plugin: {', '.join(GROUPS)}", "all kinds", positional=True),
     ] = None,
     json: Json = False,

@@ -5,10 +5,21 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
-from bidnerf.cli.options import CameraGroup, Images, MapFolder, pose_file_help, wrong_usage
-from bidnerf.cli.output import check_output, print_table, say
+from bidnerf.cli.options import (
+    CameraGroup,
+    Device,
+    Json,
+    MapFolder,
+    NoDepth,
+    Overwrite,
+    SeenImages,
+    pose_file_help,
+    require_device,
+    wrong_usage,
+)
+from bidnerf.cli.output import check_output, print_json, print_table, say
 from bidnerf.cli.parser import Group, Option, SettingsGroup, Without
 from bidnerf.cli.running import display_progress
 from bidnerf.cli.signals import defer_interruptions
@@ -17,9 +28,6 @@ from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.registry import USUAL_METHOD
 from bidnerf_core.settings import EXPERT, WholeNumbers
 
-if TYPE_CHECKING:
-    from bidnerf.results import Answers
-
 
 @dataclass(frozen=True)
 class FrameOptions:
@@ -27,7 +35,7 @@ class FrameOptions:
 
     split: Annotated[str | None, Option("NAME", "use only the frames of one split of a dataset", "all")] = None
     every: Annotated[int, WholeNumbers(1), Option("N", "use only every Nth frame")] = 1
-    depth: Annotated[bool, Option(None, "use measured depth if available")] = True
+    no_depth: NoDepth = False
     depth_sensor: Annotated[
         str, EXPERT, Option("NAME", "what measured the depth: unknown, kinect, realsense, lidar or rendered")
     ] = "unknown"
@@ -64,10 +72,13 @@ def run_track(
     sequence: Annotated[Path, Option("SEQUENCE", "folder of a dataset or images, or a video", positional=True)],
     out: Annotated[Path, Option("TRAJECTORY", pose_file_help)],
     plot: Annotated[Path | None, Option("PNG", "draw the path over the map's surface, coloured by uncertainty")] = None,
+    overwrite: Overwrite = False,
+    json: Json = False,
     *,
     frames: Annotated[FrameOptions, Group("frames", "Which frames are tracked, and whether their depth is used.")],
     camera: CameraGroup,
-    images: Annotated[Images, Without("split", "largest", "background")],
+    images: Annotated[SeenImages, Without("split")],
+    device: Device = "cpu",
     tracking: Annotated[TrackingOptions, Group("tracking", "How tracking begins, and which poses it accepts.")],
 ) -> None:
     """Find the poses of a sequence's frames in a map, in order of time.
@@ -86,20 +97,21 @@ def run_track(
             raise UsageError(where=plot, expected="a name that ends with .png or .svg")
     named = (sequence, images.camera, tracking.start, images.register_depth)
     for file in filter(None, (out, plot)):
-        check_output(file, [Path(each) for each in named if isinstance(each, str | Path)])
+        check_output(file, [Path(each) for each in named if isinstance(each, str | Path)], overwrite)
+    require_device(device)
     start = None if tracking.start is None else read_pose(tracking.start)
     with wrong_usage():
         settings = settings_of(USUAL_METHOD, {"depth_sensor": frames.depth_sensor, "risk": tracking.risk})
-    scene = load_map(map)
+    scene = load_map(map, device)
     path, began = Answers(scene, is_sequence=True), time.perf_counter()
     localizer = Localizer(scene, config=settings)
     try:
         with display_progress():
-            source = camera.source(images, localizer.assumed_cameras)
+            source = camera.source(images.camera, localizer.assumed_cameras)
             recorded = replace(images, camera=source, background=scene.bounds.background).open_sequence(sequence)
             recorded = recorded if frames.split is None else recorded.split(frames.split)
             tracker = Tracker(localizer, tracking.config, start)
-            track(tracker, recorded, every=frames.every, depth=frames.depth, answers=path)
+            track(tracker, recorded, every=frames.every, depth=not frames.no_depth, answers=path)
     finally:  # however tracking ended, the frames so far are written
         with defer_interruptions():
             if path.given:
@@ -108,19 +120,18 @@ def run_track(
                 finally:
                     if plot is not None:
                         path.plot(plot, scene.surface, scene.up)
-                _summarize(path, time.perf_counter() - began, tracking.config.frame_seconds)
+                if json:
+                    for answer in path.given:
+                        print_json(path.plain(answer))
+                else:
+                    print_table([""] * 2, path.summary(time.perf_counter() - began))
+        if path.lost and all(answer.time is None for answer in path.answers):
+            say(
+                f"the frames have no time stamps, so the first ones are assumed to be {tracking.config.frame_seconds:.3g} s"
+                " apart; if they are farther apart, set `frame_seconds`"
+            )
+        if not path.accepted:
+            say(f"no pose of {amount(len(path), 'frame')} was accepted")
     if path.unread:
         read = amount(path.unread + len(path), "frame")
         raise InputError(f"{path.unread} of {read} could not be read, see above")
-
-
-def _summarize(path: Answers, seconds: float, frame_seconds: float) -> None:
-    """Print a summary of a tracked sequence."""
-    print_table([""] * 2, path.summary(seconds))
-    if path.lost and all(answer.time is None for answer in path.answers):
-        say(
-            f"the frames have no time stamps, so the first ones are assumed to be {frame_seconds:.3g} s apart; if they"
-            " are farther apart, set --frame-seconds"
-        )
-    if not path.accepted:
-        say(f"no pose of {amount(len(path), 'frame')} was accepted")

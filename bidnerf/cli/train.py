@@ -5,19 +5,40 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
-from bidnerf.cli.options import Images, Json, MapOutput, NewMap, PointChoice, refuse, wrong_usage
+from bidnerf.cli.options import (
+    CameraOptions,
+    Images,
+    Json,
+    MapOutput,
+    NewCameraGroup,
+    NewMap,
+    Overwrite,
+    PointChoice,
+    installed,
+    refuse,
+    require_device,
+    wrong_usage,
+)
 from bidnerf.cli.output import check_folder, print_json
 from bidnerf.cli.parser import Flag, Group, Option, SettingsGroup
 from bidnerf.cli.running import interruptible_work
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
-from bidnerf_core.registry import USUAL_BACKEND, USUAL_FEATURES
+from bidnerf_core.registry import USUAL_BACKEND, USUAL_FEATURES, USUAL_POSER
 from bidnerf_core.settings import EXPERT, Range
 
 if TYPE_CHECKING:
     from bidnerf_core.maps import MapInfo
+
+
+Poser: TypeAlias = Annotated[
+    str,
+    EXPERT,
+    installed("posers"),
+    Option("NAME", "program that finds the poses of photos without any, one of 'bidnerf plugins posers'"),
+]
 
 
 def run_poses(
@@ -31,22 +52,31 @@ def run_poses(
             "estimated, starting from EXIF",
         ),
     ] = None,
-    overwrite: Annotated[Flag, Option(None, "replace the poses in --out")] = False,
+    poser: Poser = USUAL_POSER,
+    overwrite: Overwrite = False,
     json: Json = False,
+    *,
+    photos_camera: NewCameraGroup,
 ) -> None:
     """Find the poses of photos by structure from motion.
 
     They are written as a dataset. The dataset refers to the photos in place; its poses.json lists those that were left out, and why. The unit of length is
     arbitrary. Ctrl-C stops, and the same command resumes. 'bidnerf train PHOTOS' performs this step first.
     """
-    from bidnerf.structure import find_poses
+    check_folder(out, (photos,))
+    from bidnerf_core.datasets import POSERS
     from bidnerf_core.io import to_plain
 
-    check_folder(out, (photos,))
+    given = _given_camera(camera, photos_camera)
     with interruptible_work("stopping (Ctrl-C again: at once); what was found is kept"):
-        poses = find_poses(photos, out, camera, overwrite)
+        poses = POSERS.load(poser)(photos, out, given, overwrite)
     if json:
         print_json(to_plain(poses))
+
+
+def _given_camera(camera: Any, options: CameraOptions) -> Any:
+    """Return the camera given for photos: ``camera``, or a source of the focal length or the field of view."""
+    return camera if options == CameraOptions() else options.source(camera)
 
 
 def _backend_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
@@ -75,7 +105,9 @@ def _resumed(out: Any) -> MapInfo | None:
 class TrainingOptions:
     """Which training, and how far it goes."""
 
-    backend: Annotated[str | None, Option("NAME", "one of 'bidnerf backends'", USUAL_BACKEND)] = None
+    backend: Annotated[
+        str | None, installed("backends"), Option("NAME", "one of 'bidnerf backends'", USUAL_BACKEND)
+    ] = None
     quick: Annotated[Flag, Option(None, "train a short time: settings of the backend for a first map")] = False
     resume: Annotated[Flag, Option(None, "continue the interrupted training in --out")] = False
     finish: Annotated[Flag, Option(None, "end the interrupted training in --out now, with the steps done so far")] = (
@@ -91,7 +123,7 @@ class TrainingOptions:
 
 @dataclass(frozen=True)
 class PoseOptions:
-    """What is done about given poses."""
+    """Where poses come from, and what is done about those that are given."""
 
     refine_poses: Annotated[
         Literal["auto", "always", "never"],
@@ -100,6 +132,7 @@ class PoseOptions:
             "refine the given poses with the keypoints that images share: always, never, or auto (if inconsistent)",
         ),
     ] = "auto"
+    poser: Poser = USUAL_POSER
     trust_poses: Annotated[
         Flag, EXPERT, Option(None, "train even if the given poses contradict most pairs of photos")
     ] = False
@@ -121,10 +154,12 @@ def run_train(
         Path, Option("DATA", "folder of a dataset or of photos without poses, or a video", positional=True)
     ],
     out: Annotated[Path, Option("MAP", "folder for the map")],
+    json: Json = False,
     *,
     training: Annotated[TrainingOptions, Group("training", "Which field is trained, and how long.")],
     target: NewMap,
-    given_poses: Annotated[PoseOptions, Group("given poses", "What happens to the poses of the dataset.")],
+    given_poses: Annotated[PoseOptions, Group("poses", "What happens to the poses of the dataset.")],
+    photos_camera: NewCameraGroup,
     sparse_depth: Annotated[DepthPointsOptions, Group("sparse depth", "Depth for images that have none.")],
     images: Images,
     config: Annotated[
@@ -146,7 +181,6 @@ def run_train(
     of a COLMAP model, it gets a field and a surface.
     """
     from bidnerf_core.datasets import lacks_poses
-    from bidnerf_core.devices import working_device
     from bidnerf_core.io import background_colour
     from bidnerf_core.maps import DESCRIPTION, OtherSettings, TrainOptions, resume, train
 
@@ -161,7 +195,8 @@ def run_train(
         with wrong_usage():
             background_colour(images.background)
     check_folder(out, (data,), may_be_map=True)
-    working_device(target.device)
+    require_device(target.device)
+    images = replace(images, camera=_given_camera(images.camera, photos_camera))
     photos = lacks_poses(data)
     if photos:
         given = {"--depth-unit": images.depth_unit, "--register-depth": images.register_depth, "--masks": images.masks}
@@ -178,18 +213,21 @@ def run_train(
         target.overwrite,
         given_poses.refine_poses,
         given_poses.trust_poses,
+        given_poses.poser,
         sparse_depth.depth_points,
         sparse_depth.model_points,
         training.checkpoint_every,
     )
     with interruptible_work():
-        if not resumes:
-            train(data, training.backend or USUAL_BACKEND, out, config, bake=bake, options=options)
-            return
-        try:
-            resume(out, data, bake=bake, finish=training.finish, options=options)
-        except OtherSettings as error:
-            raise UsageError(error) from error
+        if resumes:
+            try:
+                scene = resume(out, data, bake=bake, finish=training.finish, options=options)
+            except OtherSettings as error:
+                raise UsageError(error) from error
+        else:
+            scene = train(data, training.backend or USUAL_BACKEND, out, config, bake=bake, options=options)
+    if json:
+        print_json(scene.describe().plain())
 
 
 def _interrupted(

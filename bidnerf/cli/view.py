@@ -8,13 +8,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from bidnerf import service, viewer
-from bidnerf.cli.options import TEST_IMAGES, Device, Host, Images, MapFolder, Method, Names, Port, Queries
+from bidnerf.cli.options import (
+    TEST_IMAGES,
+    Device,
+    Host,
+    MapFolder,
+    Method,
+    Overwrite,
+    Port,
+    Queries,
+    SeenImages,
+    require_device,
+)
 from bidnerf.cli.output import check_output, console, say, show
 from bidnerf.cli.parser import Group, Option, Without
 from bidnerf.cli.running import display_progress
 from bidnerf.service import LEAST_TOKEN, ServiceLimits
 from bidnerf.service import serve as serve_maps
-from bidnerf_core.errors import InputError, UsageError, spelling_hint
+from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.io import read_file
 from bidnerf_core.progress import counter
 from bidnerf_core.registry import USUAL_METHOD
@@ -31,6 +42,7 @@ class PageOptions:
     save: Annotated[
         Path | None, Option("PAGE.html", "write a page that opens without a server or a network, and exit")
     ] = None
+    overwrite: Overwrite = False
     results: Annotated[
         Path | None, Option("FILE", "results of 'bidnerf evaluate', as a table with links to their frames")
     ] = None
@@ -57,13 +69,9 @@ def run_view(
     ] = (),
     *,
     page: Annotated[PageOptions, Group("page", "What the page shows beside the map, and whether it is a file.")],
-    frame: Annotated[
-        Names,
-        Option("NAME...", "show only these frames of a dataset, each localized on its own", "all of the split"),
-    ] = (),
     server: Annotated[ServerOptions, Group("server", "The server of the page, and how photos are localized there.")],
-    queries: Annotated[Queries, Without("frame", "window")],
-    images: Annotated[Images, Without("register_depth", "masks", "mask_hides", "largest", "background")] = TEST_IMAGES,
+    queries: Annotated[Queries, Without("rig", "window")],
+    images: SeenImages = TEST_IMAGES,
 ) -> None:
     """View a map, and localizations in it, in a browser.
 
@@ -71,41 +79,39 @@ def run_view(
     frames of QUERY can be selected there. Photos dropped on the page take the camera given here, whose field of view can be changed
     there. With --save, QUERY is localized immediately, and the saved page shows the same without a server.
     """
+    if queries.frame and not query:
+        raise UsageError("--frame names frames of a dataset", expected="the dataset as QUERY")
+    if page.save is not None:
+        if page.save.suffix.lower() not in (".html", ".htm"):
+            raise UsageError("is no page", where=page.save, expected="a name that ends with .html")
+        check_output(page.save, (*query, *queries.depth, page.results, page.trajectory), page.overwrite)
+    else:
+        viewer.require_viewer()
+    say(f"loading {map}")
+
     from bidnerf.evaluation import read_results
-    from bidnerf.viewer import LiveView, MapView, map_json, require_viewer, row_json, serve_view, trajectory_json
+    from bidnerf.viewer import MapView, map_json, row_json, trajectory_json
     from bidnerf_core.camera import CameraSource
-    from bidnerf_core.datasets import DatasetFrames, describe_other_split
+    from bidnerf_core.datasets import DatasetFrames
     from bidnerf_core.localization import Localizer
     from bidnerf_core.maps import load_info, load_map
 
-    if frame and not query:
-        raise UsageError("--frame names frames of a dataset", expected="the dataset as QUERY")
-    if page.save is not None:
-        check_output(page.save, (*query, *queries.depth, page.results, page.trajectory))
-    else:
-        require_viewer()
+    require_device(server.device)
     info = load_info(map)
     path = None if page.trajectory is None else trajectory_json(page.trajectory, info.unit, info.origin)
     rows = () if page.results is None else tuple(row_json(row) for row in read_results([page.results]))
     scene = load_map(map, server.device)
     localizer = Localizer(scene, server.method, warm_up=page.save is None)
     source = None
-    camera = queries.camera.source(images, localizer.assumed_cameras)
+    camera = queries.camera.source(images.camera, localizer.assumed_cameras)
     if query:
         source = queries.open(query, images, localizer.assumed_cameras, scene.bounds.background)
-        data = source.capture if isinstance(source, DatasetFrames) else None
-        splits = {} if data is None else {split: data.frame_names(split) for split in data.splits}
         camera = CameraSource() if isinstance(source, DatasetFrames) else camera
-        for name in frame:
-            if name not in source.names:
-                hint = f"no frame {name!r}{spelling_hint(name, source.names)}"
-                raise InputError(describe_other_split(name, splits) or hint)
-        step = -(-len(source.names) // 24) if page.save else 1  # a page of at most 24 images, spread over all
-        indices = [source.names.index(name) for name in frame] or range(0, len(source.names), step)
-        source = source.select(indices)
+        if page.save is not None and not queries.frame:  # at most 24 images, spread over all
+            source = source.select(range(0, len(source.names), -(-len(source.names) // 24)))
     if page.save is None:
-        serve_view(
-            LiveView(localizer, source, path, rows, camera),
+        viewer.serve_view(
+            viewer.LiveView(localizer, source, path, rows, camera),
             host=server.host,
             port=server.port,
             ready=lambda address: say(f"look at {address}; Ctrl-C ends"),
@@ -149,7 +155,7 @@ def run_serve(
             "folders of maps; NAME=MAP serves one under a name other than its folder's",
             positional=True,
         ),
-    ] = (),
+    ],
     host: Host = None,
     port: Port = service.PORT,
     token_file: Annotated[
@@ -177,8 +183,7 @@ def run_serve(
     /docs describes all paths, as does /openapi.json, and /health and /metrics are for monitoring. Each request is logged as a line of
     JSON on stderr.
     """
-    if not maps:
-        raise UsageError("no MAP", expected="folders of maps")
+    require_device(device)
     stated = os.environ.get(TOKEN)
     if token_file is not None:
         try:

@@ -63,7 +63,9 @@ def write_report(
     path = folder / "index.html"
     is_ours = path.is_file() and MARK.encode() in path.read_bytes()[:4096]  # the head of the page
     if folder.is_dir() and not is_ours and not all(is_temporary(file.name) for file in folder.iterdir()):
-        raise InputError("holds something other than a bidnerf report; name another folder (`out`) or remove it", where=folder)
+        raise InputError(
+            "holds something other than a bidnerf report; name another folder (`out`) or remove it", where=folder
+        )
     frames = add_images(worst_first(table.rows)[:24], data)
     with output_folder(folder, overwrite=True):
         if not path.exists():  # so that an interrupted report is recognized as one

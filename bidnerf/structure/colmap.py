@@ -19,6 +19,7 @@ import torch
 from bidnerf.structure.sources import SourceImage
 from bidnerf_core.camera import (
     UPRIGHT,
+    Camera,
     CameraSource,
     Exif,
     Intrinsics,
@@ -98,7 +99,7 @@ class PhotoSet:
             )
 
 
-def list_photos(images: Sequence[SourceImage], given: Intrinsics | str | Path | None) -> PhotoSet:
+def list_photos(images: Sequence[SourceImage], given: Camera | CameraSource | str | Path | None) -> PhotoSet:
     """Read the headers of photos, and group the photos by camera.
 
     Raises ``InputError`` for a ``given`` camera that does not fit the photos.
@@ -120,10 +121,11 @@ def list_photos(images: Sequence[SourceImage], given: Intrinsics | str | Path | 
     return listed
 
 
-def _initial_camera(photo: ListedPhoto, given: Intrinsics | str | Path | None) -> tuple[Intrinsics, bool]:
+def _initial_camera(photo: ListedPhoto, given: Camera | CameraSource | str | Path | None) -> tuple[Intrinsics, bool]:
     raster, exif = Raster(*photo.size), replace(photo.exif, orientation=UPRIGHT)
     if given is not None:
-        return CameraSource(given).find(photo.image.file, raster).intrinsics, True
+        source = given if isinstance(given, CameraSource) else CameraSource(given)
+        return source.find(photo.image.file, raster).intrinsics, True
     if exif.has_focal_length:
         with contextlib.suppress(InputError):  # cropped after it was taken
             return camera_from_exif(str(photo.image.file), raster, exif).intrinsics, True

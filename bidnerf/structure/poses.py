@@ -52,7 +52,7 @@ from bidnerf.structure.sources import (
     refuse_panoramas,
     write_frames,
 )
-from bidnerf_core.camera import UPRIGHT, Intrinsics
+from bidnerf_core.camera import UPRIGHT, Camera, CameraSource
 from bidnerf_core.datasets import is_video
 from bidnerf_core.errors import Cancelled, InputError, InputWarning, amount
 from bidnerf_core.io import output_folder, to_plain, write_file
@@ -64,7 +64,7 @@ log = logging.getLogger("bidnerf")
 def find_poses(
     photos: str | Path,
     out: str | Path,
-    camera: Intrinsics | str | Path | None = None,
+    camera: Camera | CameraSource | str | Path | None = None,
     overwrite: bool = False,
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
@@ -74,7 +74,7 @@ def find_poses(
     """Find the poses of photos by structure from motion (COLMAP, extra ``sfm``), and write them as a dataset into ``out``.
 
     ``photos`` is a folder of photos, or a video, from which frames are chosen by motion and sharpness and
-    written as images. ``camera`` (intrinsics or a file of them) is kept fixed; without it, focal length and
+    written as images. ``camera`` (intrinsics, a file of them, or a source of either) is kept fixed; without it, focal length and
     radial distortion are estimated, starting from EXIF. If the photos fall into several models, the largest
     is kept.
 
@@ -135,7 +135,7 @@ def _search(
     images: list[SourceImage],
     work: Path,
     inputs: str,
-    camera: Intrinsics | str | Path | None,
+    camera: Camera | CameraSource | str | Path | None,
     pycolmap: Any,
 ) -> FoundPoses:
     """Find the poses of ``images`` or, if there are none, of frames of the video ``source``; write the dataset next to ``work``."""

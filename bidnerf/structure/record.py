@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from bidnerf.structure.colmap import DETECTOR
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera import Camera, CameraSource, Intrinsics
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.io import from_plain, read_json, write_file
 
@@ -89,7 +89,7 @@ class FoundPoses:
         return "\n".join(lines)
 
 
-def digest(files: Sequence[Path], camera: Intrinsics | str | Path | None) -> str:
+def digest(files: Sequence[Path], camera: Camera | CameraSource | str | Path | None) -> str:
     """Return a digest of the photos and of the settings with which their poses are estimated."""
     identities = [[str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
     settings = [repr(camera) if isinstance(camera, Intrinsics) else str(camera), repr(DETECTOR)]

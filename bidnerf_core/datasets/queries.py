@@ -108,9 +108,11 @@ class Photos:
 
 
 class DatasetFrames:
-    """Dataset frames as queries: one rig of the frames ``names``, or each frame of a split with the ``window - 1`` frames before it.
+    """Dataset frames as queries: the frames ``names`` or, without names, those of a split.
 
-    The last frame of each rig is to be localized.
+    Each is localized on its own or, with ``rig``, together with the others as one rig, of which the last frame is to be
+    localized. With a ``window``, the rig of each frame is that frame and the ``window - 1`` frames before it. Raises
+    ``InputError`` for an unknown name, a split without frames and a window that is longer than the split.
     """
 
     def __init__(
@@ -119,21 +121,23 @@ class DatasetFrames:
         split: str = "test",
         names: tuple[str, ...] = (),
         window: int = 1,
+        rig: bool = False,
     ) -> None:
         self.capture, self._split = dataset, split
         listed = dataset.frame_names(split)
         if not listed:
             raise InputError(f"split {split!r} has no frames", where=dataset.path)
         if window > len(listed):
-            raise UsageError(f"`window` is {window}", expected=f"1 to {len(listed)}")
-        self._rigs = [names] if names else [(name,) for name in listed]
-        if window > 1 and self._rigs[0][0] in listed:  # an unknown name is rejected on reading
-            self._rigs = [windowed(listed, listed.index(rig[0]), window) for rig in self._rigs]
-            for rig in self._rigs:
-                if window > len(rig):
+            raise InputError(f"`window` is {window}", expected=f"1 to {len(listed)}")
+        dataset.select(split, names)  # raises for an unknown name
+        self._rigs = [names] if rig else [(name,) for name in names or listed]
+        if window > 1:
+            self._rigs = [windowed(listed, listed.index(name), window) for (name,) in self._rigs]
+            for *before, name in self._rigs:
+                if window > 1 + len(before):
                     log.info(
-                        f"`window` {window}: {rig[-1]} has only {len(rig) - 1} before it in split {split!r}; a rig of"
-                        f" {len(rig)}"
+                        f"`window` {window}: {name} has only {len(before)} before it in split {split!r}; a rig of"
+                        f" {1 + len(before)}"
                     )
 
     def select(self, indices: Sequence[int]) -> DatasetFrames:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera import Camera, CameraSource
 from bidnerf_core.datasets.capture import warn_about
 from bidnerf_core.datasets.reader import find_reader
 from bidnerf_core.datasets.video import is_video
@@ -36,14 +36,14 @@ class Poser(Protocol):
         self,
         photos: str | Path,
         out: str | Path,
-        camera: Intrinsics | str | Path | None = None,
+        camera: Camera | CameraSource | str | Path | None = None,
         overwrite: bool = False,
         *,
         reuse: bool = False,
     ) -> PosedPhotos:
         """Write a dataset of ``photos`` (a folder, or a video) and their poses into the folder ``out``.
 
-        ``camera`` (intrinsics or a file of them) is kept fixed. ``overwrite`` is whether the folder may hold something
+        ``camera`` (intrinsics, a file of them, or a source of either) is kept fixed. ``overwrite`` is whether the folder may hold something
         else, ``reuse`` whether poses found earlier for the same photos are taken. Raises ``InputError`` if no poses can
         be found.
         """

@@ -84,20 +84,21 @@ class MapCollection:
         progress: ProgressCallback | None = None,
         cancel: Cancel | None = None,
         localizers: Mapping[str, Localizer] | None = None,
+        device: torch.device | str = "cpu",
     ) -> None:
         """Read the landmarks of all maps.
 
         ``scenes`` is a folder whose subfolders are maps, a list of maps and of folders of maps, or maps by name.
         ``method`` and ``config`` select how images are localized, see ``Localizer``. ``limit`` is the
         largest number of ranked maps that are tried, the most similar ones first. ``localizers`` holds existing localizers by
-        the names of their maps. Raises ``InputError`` if there is no map or the same one twice, and
+        the names of their maps; ``device`` is that of the maps in folders. Raises ``InputError`` if there is no map or the same one twice, and
         ``Cancelled`` once ``cancel`` returns True.
         """
         if limit < 1:
             raise InputError(f"limit is {limit}", expected="1 or more")
         self.method, self.config, self.limit = method, config, limit
         self._maps = _maps_by_name(scenes)
-        self._given_localizers = localizers or {}
+        self._given_localizers, self._device = localizers or {}, device
         self._localizer = functools.lru_cache(maxsize=6)(self._load)  # this many maps stay in memory after use
         self._infos = {
             name: scene.info if isinstance(scene, Map) else load_info(scene) for name, scene in self._maps.items()
@@ -131,7 +132,8 @@ class MapCollection:
 
     def _load(self, name: str) -> Localizer:
         scene = self._maps[name]
-        return Localizer(scene if isinstance(scene, Map) else load_map(scene), self.method, self.config, warm_up=False)
+        scene = scene if isinstance(scene, Map) else load_map(scene, self._device)
+        return Localizer(scene, self.method, self.config, warm_up=False)
 
     def rank(self, frame: Frame) -> dict[str, float]:
         """Return the cosine similarity of an image to each map, most similar first; -1 where it cannot be computed."""

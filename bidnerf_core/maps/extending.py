@@ -64,6 +64,7 @@ def extend(
     split: str = "train",
     steps: int | None = None,
     config: BakeConfig = USUAL_BAKE,
+    device: torch.device | str = "cpu",
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
 ) -> Map:
@@ -73,7 +74,7 @@ def extend(
     built, are left out. Training continues with the new photos and with ``data``, the images from which the map
     was built. Without ``data``, renderings at the cameras of those images are used instead, so that the field
     does not forget them. ``steps`` is the number of training steps, by default in proportion to the number of
-    new photos. Landmarks of the new photos are added (with ``data``, all landmarks are rebuilt), and the
+    new photos; it runs on ``device`` if the map is in a folder. Landmarks of the new photos are added (with ``data``, all landmarks are rebuilt), and the
     surface is rebaked from all cameras.
 
     A map that already contains all the photos is returned unchanged. Raises ``InputError`` if the photos show
@@ -87,7 +88,7 @@ def extend(
     if folder is not None:
         load_info(folder)  # raises if there is no map
     with job_context(progress, cancel), contextlib.nullcontext() if folder is None else lock(folder):
-        scene = scene if isinstance(scene, Map) else load_map(scene)
+        scene = scene if isinstance(scene, Map) else load_map(scene, device)
         if scene.info.interruption is not None:
             raise InputError(f"cannot be extended: {scene.info.interruption}", where=scene.name)
         if not scene.has_field:

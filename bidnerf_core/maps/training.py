@@ -16,7 +16,6 @@ import torch
 from torch import Tensor, nn
 
 from bidnerf_core.backend import load_backend, quick_config
-from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import (
     RefinementChoice,
     given_cameras,
@@ -88,6 +87,9 @@ class TrainOptions(MapOptions):
     trust_poses: bool = False
     """whether poses that contradict most pairs of images are accepted"""
 
+    poser: str = USUAL_POSER
+    """name of the poser that finds the poses of photos without any"""
+
     depth_points: str | Path | None = None
     """folder of a COLMAP sparse model whose points provide depth for images without any"""
 
@@ -155,7 +157,7 @@ def train(
         job_context(progress, cancel),
         report_finished_parts(folder),
         contextlib.nullcontext() if folder is None else map_folder(folder, options.overwrite or known is not None),
-        open_posed_images(data, options.images, folder, options.overwrite) as (posed, images),
+        open_posed_images(data, options.images, folder, options.overwrite, options.poser) as (posed, images),
     ):
         if known is not None and folder is not None:
             scene, views, tracked = _with_field(load_map(folder), posed, images, options)
@@ -279,7 +281,7 @@ def resume(
         job_context(progress, cancel),
         report_finished_parts(out),
         map_folder(out, overwrite=True),
-        open_posed_images(data, options.images, out) as (posed, images),
+        open_posed_images(data, options.images, out, poser=options.poser) as (posed, images),
     ):
         info = check_resumable(out, baking is not None)  # another process may have finished meanwhile
         images = replace(images, largest=longest_side(info))
@@ -330,7 +332,7 @@ def bake_settings(bake: bool | BakeConfig) -> BakeConfig | None:
 
 @contextlib.contextmanager
 def open_posed_images(
-    data: Images, options: DatasetOptions, out: Path | None, overwrite: bool = False
+    data: Images, options: DatasetOptions, out: Path | None, overwrite: bool = False, poser: str = USUAL_POSER
 ) -> Iterator[tuple[Images, DatasetOptions]]:
     """Yield images with poses, and the options with which to read them.
 
@@ -341,11 +343,8 @@ def open_posed_images(
     if not isinstance(data, str | Path) or not lacks_poses(data):
         yield data, options
         return
-    camera = options.camera
-    if not (camera is None or isinstance(camera, Intrinsics | str | Path)):
-        raise InputError(f"camera is a {type(camera).__name__}", where=data, expected="intrinsics or a file of them")
     with tempfile.TemporaryDirectory() if out is None else contextlib.nullcontext(poses_folder(out)) as folder:
-        found = POSERS.load(USUAL_POSER, str(data))(data, folder, camera, overwrite, reuse=True)
+        found = POSERS.load(poser, str(data))(data, folder, options.camera, overwrite, reuse=True)
         if options.split == "train":
             tested = len(range(0, found.placed, HOLD_OUT_EVERY))
             log.info(
