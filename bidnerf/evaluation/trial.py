@@ -210,7 +210,10 @@ def open_data(data: Images, options: DatasetOptions, stored: Map | None = None) 
         capture = capture_of(views, Path("views"))
     usual = replace(options, camera=None, register_depth=None, depth_unit=None, largest=None)
     if superfluous := [name for name, value in vars(options).items() if value != getattr(usual, name)]:
-        raise InputError(f"has its own cameras and depth; leave out {enumeration(superfluous)}", where=capture.path)
+        raise InputError(
+            f"has its own cameras and depth; leave out {enumeration([f'`{name}`' for name in superfluous])}",
+            where=capture.path,
+        )
     return capture if options.mask_folder is None else capture.with_masks(options.mask_folder)
 
 

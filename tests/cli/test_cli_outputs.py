@@ -267,7 +267,9 @@ def files(tmp_path: Path) -> Path:
 def test_a_file_that_is_read_or_of_a_map_is_no_output(files: Path, out: str) -> None:
     (files / "link.json").symlink_to(files / "start.json")
     with pytest.raises(UsageError, match=re.escape(str(files / out))):
-        check_output(files / out, (files / "photo.png", None, files / "start.json", str(files / "data")))
+        check_output(
+            files / out, (files / "photo.png", None, files / "start.json", str(files / "data")), overwrite=True
+        )
 
 
 def test_a_folder_in_which_no_file_can_be_created_is_refused_before_any_work(
@@ -295,9 +297,16 @@ def test_a_map_and_a_model_that_exist_are_refused_before_any_work(bidnerf: Run, 
         assert_refused(found, 1, files / "points3D.txt", "would be replaced")
 
 
+def test_a_file_that_exists_is_replaced_only_if_the_user_says_so(bidnerf: Run, files: Path) -> None:
+    photo, out = files / "photo.png", files / "start.json"
+    for words in (["localize", "MAP", photo, "--out"], ["track", "MAP", photo, "--out"]):
+        assert_refused(bidnerf(*words, out), 1, out, "exists already", "--overwrite")
+        assert "exists already" not in bidnerf(*words, out, "--overwrite").err
+
+
 def test_new_files_beside_inputs_are_outputs(files: Path) -> None:
     for name in ("poses.json", "data/poses.json", "start.json"):
-        check_output(files / name, (files / "photo.png", files / "data", files / "missing"))
+        check_output(files / name, (files / "photo.png", files / "data", files / "missing"), overwrite=True)
 
 
 @pytest.mark.parametrize(

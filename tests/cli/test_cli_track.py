@@ -90,7 +90,7 @@ def test_a_file_that_cannot_be_read_is_left_out(bidnerf: Run, tmp_path: Path) ->
     assert "; left out" in err
     assert re.search(r"not read +1 frame\b", out)
     assert read_trajectory(tmp_path / "path.txt").times.tolist() == [0, 1, 3, 4, 5]
-    status, _, err = bidnerf("track", "MAP", broken, "--out", tmp_path / "path.txt", "--every", "2")
+    status, _, err = bidnerf("track", "MAP", broken, "--out", tmp_path / "path.txt", "--every", "2", "--overwrite")
     assert status == 1, err
     assert read_trajectory(tmp_path / "path.txt").times.tolist() == [0, 4]
 
@@ -111,7 +111,7 @@ def test_frames_of_another_scene_are_doubted(bidnerf: Run, tmp_path: Path) -> No
 def test_one_split_of_a_dataset_is_tracked(bidnerf: Run, tmp_path: Path) -> None:
     named = [View(replace(f, depth=None), T) for _, f, T in flight()[:3]]
     write_transforms(tmp_path / "data", {"train": named[:1], "test": named[1:]}, (0.0, 0.0, 0.0))
-    track = ("track", "MAP", tmp_path / "data", "--out", tmp_path / "path.json", "--split")
+    track = ("track", "MAP", tmp_path / "data", "--out", tmp_path / "path.json", "--overwrite", "--split")
     bidnerf(*track, "test").succeed()
     assert len(json.loads((tmp_path / "path.json").read_text())) == 2
     assert_refused(bidnerf(*track, "val"), 1, tmp_path / "data", "'val'", "train, test", after_remarks=True)

@@ -36,7 +36,7 @@ def open_map(patch: pytest.MonkeyPatch, scene: object) -> None:
     """Let commands open a map, whatever folder they name."""
     for name in evaluation.__all__:  # which would otherwise be imported with what is patched, and keep it
         getattr(evaluation, name)
-    patch.setattr("bidnerf_core.maps.load_map", lambda folder: scene)
+    patch.setattr("bidnerf_core.maps.load_map", lambda folder, device="cpu": scene)
 
 
 def write_flight(folder: Path, frames: Sequence[tuple[Frame, SE3]]) -> Path:
