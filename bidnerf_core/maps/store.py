@@ -90,7 +90,7 @@ PARTS = {
         _json,
         lambda path: from_plain(
             CaptureReport,
-            read_json(path, "a capture record, which 'bidnerf bake --data' can recreate"),
+            read_json(path, "a capture record, which 'bidnerf bake' with the dataset (`data`) can recreate"),
             str(path),
         ),
         "json",

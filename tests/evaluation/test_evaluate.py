@@ -309,7 +309,7 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
             "camera is a Intrinsics",
             "text, a number or the path of a file",
         ),
-        ({"images": DatasetOptions("cam.json", "test")}, "leave out camera", None),
+        ({"images": DatasetOptions("cam.json", "test")}, "leave out `camera`", None),
         ({"scene": BLOBS, "workers": 0}, "workers is 0", "1 or more"),
         ({"scene": BLOBS, "workers": -1}, "workers is -1", "1 or more"),
         ({"seed": -1}, "seed is -1", "a whole number, 0 to 2,147,483,647"),

@@ -185,7 +185,7 @@ def test_the_command(bidnerf: Run, grounds: list[Map], tmp_path: Path, monkeypat
     known = dict(zip(("m0", "m4", "bare"), grounds, strict=True))
     loaded = []
 
-    def load(folder: Path) -> Map:
+    def load(folder: Path, device: str = "cpu") -> Map:
         loaded.append(folder.name)
         return known[folder.name]
 

@@ -370,7 +370,7 @@ def test_what_is_no_map_or_cannot_be_localized_is_refused(room: Map, query: Quer
 def test_view_saves_a_page_of_photos(bidnerf: Run, room: Map, tmp_path: Path) -> None:
     photo, page = viewed.photo_file(tmp_path), tmp_path / "page.html"
     place, none = ["view", room.folder, photo], tmp_path / "none.png"
-    for wrong, status in ((tmp_path / "page.txt", 1), (photo, 2)):
+    for wrong, status in ((tmp_path / "page.txt", 2), (photo, 2)):
         assert_refused(bidnerf(*place, "--save", wrong), status, wrong, after_remarks=True)
     nothing = bidnerf("view", room.folder, none, "--save", page)
     assert_refused(nothing, 1, none, after_remarks=True)
