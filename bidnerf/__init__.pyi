@@ -19,7 +19,6 @@ from bidnerf_core.errors import InputWarning as InputWarning
 from bidnerf_core.frames import Frame as Frame
 from bidnerf_core.frames import View as View
 from bidnerf_core.geometry import SE3 as SE3
-from bidnerf_core.localization import Corrector as Corrector
 from bidnerf_core.localization import Localization as Localization
 from bidnerf_core.localization import Outcome as Outcome
 from bidnerf_core.localization import Tracker as Tracker

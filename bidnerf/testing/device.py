@@ -315,7 +315,7 @@ def _first_order(problem: Problem, level: int, mode: Elsewhere | None) -> Tensor
 def _second_order(problem: Problem, level: int, mode: Elsewhere) -> None:
     terms = RayTerms(ColourSettings(), DepthLossSettings())
     rays = terms.term(problem, CHECKED_RAYS, 0, level)
-    start = move_to(states_at(problem.start_for("bid-lm")[None]), DEVICE)
+    start = move_to(states_at(problem.start_for("bid")[None]), DEVICE)
     with without_waiting():
         descend(start, [rays], 1)
         with mode.strict():

@@ -13,7 +13,6 @@ from .accept import same_pose as same_pose
 from .adam import AdamSteps as AdamSteps
 from .auto import localize_by_landmarks as localize_by_landmarks
 from .by_surface import is_blank as is_blank
-from .corrector import Corrector as Corrector
 from .explanations import CAMERAS as CAMERAS
 from .explanations import MOVING as MOVING
 from .localizer import Localizer as Localizer
@@ -29,9 +28,7 @@ from .matching import LandmarkMatcher as LandmarkMatcher
 from .methods import METHODS as METHODS
 from .methods import USUAL_METHOD as USUAL_METHOD
 from .methods import BidConfig as BidConfig
-from .methods import BidLmConfig as BidLmConfig
 from .methods import InerfConfig as InerfConfig
-from .methods import InerfLmConfig as InerfLmConfig
 from .methods import Method as Method
 from .methods import find_method as find_method
 from .methods import matches_landmarks as matches_landmarks

@@ -5,9 +5,6 @@ The first-order methods apply Adam to the loss of sampled rays. ``bid`` uses col
 NeRF renders hierarchically with its coarse and fine networks. iNeRF optimizes the magnitude and axis of one screw motion from the start;
 here, each step is a separate update in the same frame, the world's. The two differ only to second order, and such an update has no axis
 that is undefined at magnitude 0.
-
-The second-order methods run successive halving on poses around the start, from coarse to fine: ``bid-lm`` on colour and depth,
-``inerf-lm`` on colour.
 """
 
 from __future__ import annotations
@@ -15,11 +12,9 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
-from itertools import chain
-from typing import Annotated, Any
+from typing import Any
 
 import torch
 from torch import Generator
@@ -31,19 +26,7 @@ from bidnerf_core.localization.accept import Support, support
 from bidnerf_core.localization.adam import follow_gradient, recent_loss
 from bidnerf_core.localization.problem import Problem, middle_of_view, pivot
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.search import (
-    COLOUR_SIGMA,
-    SHAPE_SIGMA,
-    RayTerms,
-    Stage,
-    centre_in_view,
-    colour_stages,
-    halve,
-    image_stages,
-    localization_by_rays,
-    neighbours,
-    states_at,
-)
+from bidnerf_core.localization.search import RayTerms, states_at
 from bidnerf_core.localization.settings import (
     AdamSettings,
     ColourSettings,
@@ -51,15 +34,13 @@ from bidnerf_core.localization.settings import (
     DepthSettings,
     DescentSettings,
     ReachSettings,
-    RefinementSettings,
     objective_of,
     rendered_depth_scale,
 )
-from bidnerf_core.localization.terms.images import ColourScales, field_renderer
 from bidnerf_core.localization.terms.sampled import SampledLoss
 from bidnerf_core.registry import USUAL_METHOD as USUAL_METHOD
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
-from bidnerf_core.settings import Range, Settings, from_flat
+from bidnerf_core.settings import Settings, from_flat
 
 RAYS = 1024
 """Number of rays by which the pose that a first-order method found is judged."""
@@ -99,7 +80,7 @@ def _defects(method: Any) -> Iterator[str]:
     yield from interface_defects(method, ("summary", "config_type"), {"solve": ("problem", "config", "seed")})
 
 
-METHODS: Plugins[Method] = Plugins("methods", _defects, first=("auto", "bid", "inerf", "bid-lm", "inerf-lm"))
+METHODS: Plugins[Method] = Plugins("methods", _defects, first=("auto", "bid", "inerf"))
 """The localization methods by name, those of plugins included."""
 
 
@@ -142,9 +123,6 @@ def settings_of(method: str, values: dict[str, Any], where: str = "config", pres
     Raises ``InputError``, prefixed with ``where``, for an unknown method or name, or a value that is not allowed.
     """
     return from_flat(find_method(method).settings(preset), values, where)
-
-
-# First-order methods.
 
 
 @dataclass(frozen=True)
@@ -243,96 +221,4 @@ INERF = Method(
     # The settings of BID-NeRF's comparison: iNeRF's own learning rate, and 1000 steps of 2048 rays.
     presets={"paper": InerfConfig(adam=AdamSettings(max_steps=1000, learning_rate=0.01))},
     summary="Adam on the colours of one image in full detail (iNeRF)",
-)
-
-
-# Second-order methods.
-
-IMAGE_STAGES = ((16, 0, 24), (16, 8, 6), (24, 6, 2), (48, 4, 2))
-"""The stages of a search with small renderings: pixels of the longer side, steps, poses kept."""
-
-
-@dataclass(frozen=True)
-class BidLmConfig(Settings):
-    """Settings of method ``bid-lm``."""
-
-    poses: Annotated[int, Range(1, 10**5)] = 32  # number of poses tried near the start, including the start
-    steps: RefinementSettings = RefinementSettings(fine_steps=6)
-    depth: DepthLossSettings = DepthLossSettings()
-    exposure: bool = False  # estimate a gain and an offset for each colour channel
-
-
-@dataclass(frozen=True)
-class InerfLmConfig(Settings):
-    """Settings of method ``inerf-lm``."""
-
-    poses: Annotated[int, Range(1, 10**5)] = 256  # number of poses tried near the start, including the start
-    steps: RefinementSettings = RefinementSettings()
-    exposure: bool = False  # estimate a gain and an offset for each colour channel
-
-
-def bid_lm(problem: Problem, config: BidLmConfig, seed: int = 0) -> Localization:
-    """Refine poses around ``problem.start`` on colour and depth; poses and pixels are drawn with ``seed``.
-
-    Raises ``InputError`` if there is no start.
-    """
-    return _search_near_start(problem, config, config.depth, (0.1, 0.12), seed, "bid-lm")
-
-
-def inerf_lm(problem: Problem, config: InerfLmConfig, seed: int = 0) -> Localization:
-    """Refine poses around ``problem.start`` on colour alone; poses and pixels are drawn with ``seed``.
-
-    The method needs only the field; it uses neither measured depth nor a baked surface. Raises ``InputError`` if there is no start.
-    """
-    return _search_near_start(problem.without_depth(), config, None, (0.04, 0.25), seed, "inerf-lm")
-
-
-def _search_near_start(
-    problem: Problem,
-    config: BidLmConfig | InerfLmConfig,
-    depth: DepthLossSettings | None,
-    spread: tuple[float, float],
-    seed: int,
-    method: str,
-) -> Localization:
-    """Refine poses around the start; ``spread`` holds their deviations, as a fraction of the scene's distance and in radians.
-
-    Colours alone have a narrow basin of convergence, so images without depth are first compared with small renderings.
-    """
-    began, start = time.perf_counter(), problem.start_for(method)
-    middle, steps = middle_of_view(problem, start), config.steps
-    poses = neighbours(start, config.poses, spread[0] * float(middle.norm()), spread[1], seed)
-    terms, rays = RayTerms(steps.colour, depth, config.exposure), steps.fine_rays
-    if depth is not None and problem.has_depth:
-        poses = SE3.cat([poses, centre_in_view(problem, poses, middle)])
-        # Coarse steps with depth average colours over squares of eight pixels.
-        coarse = partial(terms.term, problem, level=0, blur=8)
-        stages: Iterable[Stage] = (
-            Stage([coarse(rays // 8, seed, wide=3.0)], 0, 6),
-            Stage([coarse(rays // 8, seed + 1, sigma=SHAPE_SIGMA)], 4, 2),
-            Stage([coarse(rays // 4, seed + 2, sigma=SHAPE_SIGMA)], 4, 1),
-            Stage([terms.term(problem, rays, seed + 3, sigma=SHAPE_SIGMA / 3)], steps.fine_steps, 1),
-        )
-        fresh = terms.term(problem, rays, seed + 4, sigma=SHAPE_SIGMA / 3)
-    else:
-        renderer = field_renderer(problem.level(0), problem.bounds)
-        images = image_stages(problem, renderer, problem.device, ColourScales(), IMAGE_STAGES)
-        stages = chain(images, colour_stages(problem, terms, steps, seed))
-        fresh = terms.term(problem, rays, seed + 2, sigma=COLOUR_SIGMA / 2)
-    found = halve(states_at(poses), stages, middle, problem.device)
-    return localization_by_rays(problem, found, fresh, middle, steps.converged_inliers, method, began)
-
-
-BID_LM = Method(
-    bid_lm,
-    BidLmConfig,
-    needs_start=True,
-    summary="second-order steps on colour and depth, from coarse to fine",
-)
-INERF_LM = Method(
-    inerf_lm,
-    InerfLmConfig,
-    needs_start=True,
-    uses_depth=False,
-    summary="second-order steps on colour alone, from coarse to fine",
 )

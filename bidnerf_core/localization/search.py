@@ -17,7 +17,7 @@ from bidnerf_core.devices import move_to, without_waiting
 from bidnerf_core.errors import amount
 from bidnerf_core.geometry import SE3, Robust
 from bidnerf_core.localization.accept import DISPLACEMENT, Support, same_pose, support
-from bidnerf_core.localization.problem import Problem, rendered_middle
+from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, current_record
 from bidnerf_core.localization.settings import (
     ColourSettings,
@@ -173,19 +173,6 @@ def colour_stages(problem: Problem, terms: RayTerms, steps: RefinementSettings, 
     coarse = terms.term(problem, steps.fine_rays // 4, seed, level=0, blur=2, sigma=COLOUR_SIGMA)
     yield Stage([coarse], min(4, steps.fine_steps), 2)
     yield Stage([terms.term(problem, steps.fine_rays, seed + 1, sigma=COLOUR_SIGMA / 2)], steps.fine_steps, 1)
-
-
-@torch.no_grad()
-def centre_in_view(problem: Problem, T: SE3, middle: Float[Tensor, "3"]) -> SE3:
-    """Return the poses T (h), each camera shifted so that the median rendered point coincides with the measured ``middle``.
-
-    When a scene is seen from outside, the main error is often that the scene appears in the wrong part of the image. The shift
-    removes this error with one rendering of a few rays, even where the loss has no useful gradient. A pose is
-    unchanged if nothing is rendered.
-    """
-    shift = rendered_middle(problem.level(0), problem.bounds, problem.views, T).cpu().double() - middle
-    shift = torch.where(shift.isfinite(), shift, 0)
-    return SE3(T.rotation, T.translation + (T.rotation @ shift[..., None])[..., 0])
 
 
 def localization_by_rays(

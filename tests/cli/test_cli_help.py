@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 CHOICES = {
     "train": [["--backend", info.name] for info in list_plugins("backends") if info.distribution == "bidnerf"],
     "localize": [["--method", name] for name in METHODS],
-    "compare": [["--method", "bid-lm"]],
+    "compare": [["--method", "bid"]],
 }
 """Options on which other options depend; settings of a method are the same in each command that takes one."""
 PAGES = pytest.mark.parametrize(

@@ -56,7 +56,7 @@ def test_the_command_finds_the_pose(bidnerf: Run, photo: Path, monkeypatch: pyte
     assert "camera unknown, assumed to be that of the map's images" in err
 
 
-@pytest.mark.parametrize("option", [["--no-landmarks"], ["--method", "inerf-lm", "--start", "start.json"]])
+@pytest.mark.parametrize("option", [["--no-landmarks"], ["--method", "inerf", "--start", "start.json"]])
 def test_methods_that_do_not_estimate_a_focal_length_need_one(
     bidnerf: Run, photo: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, option: list[str]
 ) -> None:

@@ -169,7 +169,7 @@ def test_a_bad_query_is_refused_in_one_line(query: Any, start: Any, found: str, 
     [
         (FIELD, "auto", None, "Localizer", "got a GaussianBlobs", FOLDER),
         (None, "auto", None, "Localizer", "got a NoneType", FOLDER),
-        (MAP, "icp", None, None, "no method 'icp'; installed: auto, bid, bid-lm, inerf, inerf-lm", None),
+        (MAP, "icp", None, None, "no method 'icp'; installed: auto, bid, inerf", None),
         (MAP, "bid", AutoConfig(), None, f"{TAKES}, got a AutoConfig", None),
         (MAP, "bid", 5, None, f"{TAKES}, got a int", None),
         (MAP, "bid", {"ray": 5}, "config", "BidConfig has no setting 'ray'", None),

@@ -13,13 +13,10 @@ from bidnerf.results import pose_error
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import states_at
 from bidnerf_core.localization.by_surface import by_images, hypotheses
-from bidnerf_core.localization.problem import middle_of_view
 
 # Inside: the distribution of proposals and the margin over other poses, of which an answer keeps one
-from bidnerf_core.localization.search import Stage, centre_in_view, halve, neighbours
+from bidnerf_core.localization.search import Stage, halve, neighbours
 from bidnerf_core.mapping import Normal, P, States
-from blob_images import BOUNDS, FIELD, FRAME, TRUTH
-from problems import single
 
 PLACES = torch.tensor([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]], dtype=torch.float64)
 OFFSETS = torch.tensor([0.0, 30.0], dtype=torch.float64)
@@ -96,18 +93,6 @@ def test_neighbours_are_even_and_hold_the_start() -> None:
     expected = torch.tensor([0.2] * 3 + [0.1] * 3, dtype=torch.float64)
     torch.testing.assert_close(xi.std(0), expected, rtol=0.1, atol=0)
     assert float(xi.mean(0).abs().max()) < 0.01
-
-
-def test_centring_takes_back_most_of_a_shift_and_leaves_a_view_of_nothing() -> None:
-    start = TRUTH.retract(torch.tensor([0.4, -0.3, 0.2, 0, 0, 0], dtype=torch.float64))
-    problem = single(FIELD, BOUNDS, FRAME, start)
-    middle, found = middle_of_view(problem, start), start[None]
-    for _ in range(3):
-        found = centre_in_view(problem, found, middle)
-    assert torch.equal(found.rotation[0], start.rotation)
-    assert float((found.translation[0] - TRUTH.translation).norm()) < 0.5 * 0.54  # the median of few pixels
-    away = TRUTH.retract(torch.tensor([0, 0, 0, math.pi, 0, 0], dtype=torch.float64))[None]
-    assert torch.equal(centre_in_view(problem, away, middle).matrix(), away.matrix())
 
 
 def test_images_find_the_pose_without_depth() -> None:

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bidnerf_core.localization import METHODS, AutoConfig, BidConfig, BidLmConfig, find_method, settings_of
+from bidnerf_core.localization import METHODS, AutoConfig, BidConfig, find_method, settings_of
 from bidnerf_core.settings import EXPERT, Above, Count, OneOf, Range, Settings, from_flat, to_flat
 from refusals import refused
 
@@ -168,7 +168,7 @@ def test_flat_names_are_unique_and_survive_json_and_every_number_is_limited(meth
 
 
 def test_a_method_that_is_unknown_is_named() -> None:
-    with refused(found="no method 'gauss'; installed: auto, bid, bid-lm, inerf"):
+    with refused(found="no method 'gauss'; installed: auto, bid, inerf"):
         settings_of("gauss", {})
 
 
@@ -176,6 +176,6 @@ def test_settings_are_checked_however_they_are_made() -> None:
     with refused(found="learning_rate is 0.0", expected="more than 0"):
         dataclasses.replace(BidConfig().adam, learning_rate=0.0)
     with refused(found="fine_rays is 6", expected="7 to 10,000,000"):
-        dataclasses.replace(BidLmConfig().steps, fine_rays=6)
+        dataclasses.replace(AutoConfig().by_colour, fine_rays=6)
     with refused(found="points is 49", expected="50 to 1,000,000"):
         AutoConfig(points=49)

@@ -41,7 +41,7 @@ from bidnerf_core.registry import registered
 from optional import require
 
 QUICK = AutoConfig(points=1000, hypotheses=64, rounds=1, refine_steps=0, fused_rays=128)
-FEW = {"poses": 8, "fine_rays": 512}
+FEW = {"rays": 256, "max_steps": 60, "learning_rate": 0.08, "decay": 0.5, "decay_steps": 20, "depth_weight": 0.3}
 
 
 class TestSift(FeaturesContract):
@@ -52,8 +52,8 @@ class TestAuto(MethodContract):
     name, config = "auto", QUICK
 
 
-class TestBidLm(MethodContract):
-    name, config = "bid-lm", settings_of("bid-lm", FEW)
+class TestBid(MethodContract):
+    name, config = "bid", settings_of("bid", FEW)
     largest_error = 0.05
 
 

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 import torch
 
-from bidnerf import SE3, Corrector, Frame, InputError, Intrinsics, Localization, Outcome
+from bidnerf import SE3, Frame, InputError, Intrinsics, Localization, Outcome
+from bidnerf_ros2.corrector import Corrector
 from refusals import refused
 
 CAMERA = Intrinsics(width=4, height=3, fx=4.0, fy=4.0, cx=2.0, cy=1.5)

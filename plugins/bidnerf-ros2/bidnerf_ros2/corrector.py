@@ -8,8 +8,7 @@ from threading import Lock
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.localizer import Localizer
-from bidnerf_core.localization.result import Localization
+from bidnerf_core.localization import Localization, Localizer
 
 
 class Corrector:
