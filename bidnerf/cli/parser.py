@@ -425,6 +425,8 @@ def conversion(hint: Any, notes: Sequence[Any] = ()) -> tuple[int | str | None, 
 
     def convert_word(word: str) -> Any:
         word = word.removeprefix(ESCAPE)
+        if word is argparse.SUPPRESS:  # argparse converts its own default of an optional positional argument
+            return word
         if word in choices:
             return choices[word]
         if optional and word == "None":

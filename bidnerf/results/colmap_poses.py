@@ -34,7 +34,7 @@ def check_pose_file(path: Path) -> None:
 
 
 def write_colmap_poses(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write a COLMAP model: images.txt, and cameras.txt and points3D.txt beside it.
+    """A COLMAP model: images.txt, and cameras.txt and points3D.txt beside it.
 
     Image names are file paths relative to the folder that contains all of the images. Raises ``InputError`` for
     a lens that COLMAP cannot describe, and as ``check_pose_file`` does.

@@ -110,7 +110,7 @@ def time_stamps(images: Sequence[PosedImage]) -> tuple[list[tuple[float, PosedIm
 
 
 def write_tum(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write a TUM trajectory: rows of time stamp, position, and unit quaternion with the scalar last.
+    """A TUM trajectory: rows of time stamp, position, and unit quaternion with the scalar last.
 
     See ``time_stamps`` and https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats. If the stamps are not
     times, a comment before each row names the image, since other programs skip comments.
@@ -126,7 +126,7 @@ def write_tum(path: Path, images: Sequence[PosedImage]) -> None:
 
 
 def write_pose_json(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write a JSON list of poses with OpenCV axes, times and covariances.
+    """A JSON list of poses with OpenCV axes, times and covariances.
 
     Each line holds an object with "frame", "time", "T_world_camera", "covariance" and "unit".
     ``time`` (seconds) and ``covariance`` (6x6, tangent of translation in ``unit``, then rotation in rad, at
@@ -145,7 +145,7 @@ def write_pose_json(path: Path, images: Sequence[PosedImage]) -> None:
 
 
 def write_pose_transforms(path: Path, images: Sequence[PosedImage], **more: Any) -> None:
-    """Write a dataset in nerfstudio's format: poses with OpenGL axes, and one camera per image.
+    """A dataset in nerfstudio's format: poses with OpenGL axes, and one camera per image.
 
     Each ``file_path`` is relative to the folder of the file, and ``more`` holds further entries. The entries
     describe the image files as stored, so the poses and cameras of photos with an EXIF orientation are rotated.

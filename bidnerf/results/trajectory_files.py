@@ -13,7 +13,7 @@ from bidnerf_core.io import write_file
 
 
 def write_kitti_poses(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write KITTI poses: rows of the twelve numbers of 3x4 camera-to-world matrices, without times."""
+    """KITTI poses: rows of the twelve numbers of 3x4 camera-to-world matrices, without times."""
     numbers = [image.number for image in images]
     if numbers != list(range(len(numbers))):
         skipped = next(index for index, number in enumerate(numbers) if index != number)
@@ -28,7 +28,7 @@ def write_kitti_poses(path: Path, images: Sequence[PosedImage]) -> None:
 
 
 def write_euroc_poses(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write camera (not body) poses in EuRoC's format: rows of nanoseconds, position, and quaternion (w, x, y, z).
+    """Camera (not body) poses in EuRoC's format: rows of nanoseconds, position, and quaternion (w, x, y, z).
 
     See ``time_stamps`` for the times. The header names the unit of the positions, which is ``[m]`` only for metric maps.
     """
