@@ -231,8 +231,13 @@ def run_report(
     results: Annotated[tuple[Path, ...], Option("RESULTS...", "files written by 'bidnerf evaluate'", positional=True)],
     out: Annotated[Path, Option("DIR", "folder for index.html and the figures as PNG and SVG")] = Path("report"),
     criterion: Annotated[
-        Literal["10%", "5deg 0.05", "1deg 0.02"] | None,
-        Option(None, "success criterion for displays that use only one", "10%; 5deg 0.05 if trials had no start"),
+        Literal["10%", "5deg", "1deg"] | None,
+        Option(
+            None,
+            "success criterion for displays that use only one: 10% of the start's error, 5 degrees and 0.05 or 1 degree and"
+            " 0.02 of the map's unit",
+            "10%; 5deg if trials had no start",
+        ),
     ] = None,
     title: Annotated[str, EXPERT, Option("TEXT", "title of the page")] = "Localization results",
     view: Annotated[
@@ -250,10 +255,12 @@ def run_report(
     """
     # Imported when a report is made, since help pages do not need it.
     from bidnerf.evaluation import ResultTable, choose_criterion, read_runs, write_report
+    from bidnerf.results import CRITERIA
 
     table = ResultTable.load(*results)
     with wrong_usage():
-        chosen = choose_criterion(criterion, table.groups)
+        name = next((name for name in CRITERIA if criterion and name.startswith(criterion)), None)
+        chosen = choose_criterion(name, table.groups)
     if view is not None and not view.is_file():
         raise InputError("no such page", where=view, expected="one written by 'bidnerf view MAP --results ... --save'")
     if missing := [folder for folder in data if not Path(folder).is_dir()]:

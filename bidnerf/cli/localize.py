@@ -139,7 +139,6 @@ def run_localize(
     OpenCV axes (x right, y down, z forward).
     """
     from bidnerf.results import Answers, localize_each
-    from bidnerf_core.datasets import Photos
     from bidnerf_core.localization import (
         Localizer,
         landmark_cameras,
@@ -158,23 +157,24 @@ def run_localize(
     with wrong_usage():
         require_start(method.method, start.start is not None or start.perturb is not None)
     require_device(device)
+    if start.perturb is not None and not queries.is_dataset(paths):
+        raise UsageError("--perturb moves the true pose, which photos do not have;", expected="--start")
     files = (*paths, *queries.depth, start.start, images.camera, images.register_depth)
     inputs = [Path(file) for file in files if isinstance(file, str | Path)]
     output.check(inputs)
+    opener = queries.opener(paths, images)
     if len(maps) > 1 or maps_in(map) not in ([], [map]):
         _check_for_several(output, start)
         with display_progress():
             collection = MapCollection(maps, method.method, method.config, device=device)
         finder: Localizer | MapCollection = collection
-        answers, source = Answers(collection), queries.open(paths, images, collection.cameras)
+        answers, source = Answers(collection), opener(collection.cameras, None)
     else:
         scene = load_map(map, device)
         cameras = landmark_cameras(scene) if matches_landmarks(method.method, method.config) else ()
-        source = queries.open(paths, images, cameras, scene.bounds.background)
+        source = opener(cameras, scene.bounds.background)
         answers = Answers(scene)
         finder = Localizer(scene, method.method, method.config, warm_up=len(source.names) > 1)
-    if start.perturb is not None and isinstance(source, Photos):
-        raise UsageError("--perturb moves the true pose, which photos do not have;", expected="--start")
     if output.draw is not None:
         for name in source.names:
             check_output(output.picture(name), inputs, output.overwrite)

@@ -23,6 +23,7 @@ from bidnerf.cli.options import (
     installed,
     refuse,
     require_device,
+    require_inputs,
     require_one,
 )
 from bidnerf.cli.output import check_folder, check_output, print_json, say, show
@@ -284,6 +285,7 @@ def run_bake(
     if data is None:
         refuse({"--masks": images.masks}, "was given without --data", expected="the dataset that they belong to")
     require_device(device)
+    require_inputs(data)
     # The baked parts may be damaged, so they are not loaded here.
     scene = load_map(map, device, baked=False)
     with interruptible_work():
@@ -325,6 +327,7 @@ def run_extend(
     from bidnerf_core.maps import extend, load_info
 
     require_device(device)
+    require_inputs(new, data)
     info = load_info(map)
     given = {"--camera": images.camera, "--register-depth": images.register_depth, "--depth-unit": images.depth_unit}
     is_stated = any(value is not None for value in given.values())

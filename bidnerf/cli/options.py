@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
@@ -145,6 +145,13 @@ def require_device(device: str) -> None:
         working_device(device)
 
 
+def require_inputs(*paths: Path | None) -> None:
+    """Raise ``InputError`` if a file or a folder does not exist, before anything is loaded."""
+    for path in filter(None, paths):
+        if not path.exists():
+            raise InputError("no such file or folder", where=path, expected="the name of one that exists")
+
+
 @contextlib.contextmanager
 def wrong_usage() -> Iterator[None]:
     """Convert an ``InputError`` in the block to ``UsageError``, for arguments that are wrong whatever files contain."""
@@ -210,39 +217,46 @@ class QueryOptions:
         if self.rig and self.window > 1:
             raise UsageError("--rig and --window exclude each other", expected="only one of them")
 
-    def open(
-        self,
-        paths: Sequence[Path],
-        images: DatasetOptions,
-        assumed: Sequence[Intrinsics],
-        background: Background | None = None,
-    ) -> Photos | DatasetFrames:
-        """Return the queries named by the QUERY arguments: image files and folders of photos, or one dataset.
-
-        ``background`` is that of the map, or None if there are several maps. Raises ``InputError`` if the arguments hold neither
-        photos nor a dataset, and ``UsageError`` for options that apply only to the other kind.
-        """
-        from bidnerf_core.datasets import DatasetFrames, Photos, depth_files, find_reader, photo_files
+    def is_dataset(self, paths: Sequence[Path]) -> bool:
+        """Return whether the QUERY arguments are a dataset, rather than photos."""
+        from bidnerf_core.datasets import find_reader
         from bidnerf_core.io import IMAGE_SUFFIXES
 
-        is_dataset = (p.suffix.lower() not in IMAGE_SUFFIXES and find_reader(p) is not None for p in paths)
-        if self.frame or any(is_dataset):
+        return bool(self.frame) or any(p.suffix.lower() not in IMAGE_SUFFIXES and find_reader(p) for p in paths)
+
+    def opener(self, paths: Sequence[Path], images: DatasetOptions) -> QueryOpener:
+        """Check the QUERY arguments before a map is loaded, and return a function that opens them.
+
+        The arguments are image files and folders of photos, or one dataset. Raises ``InputError`` if they hold neither,
+        and ``UsageError`` for options that apply only to the other kind.
+        """
+        from bidnerf_core.datasets import DatasetFrames, Photos, depth_files, photo_files
+
+        if self.is_dataset(paths):
             if len(paths) > 1:
                 raise UsageError(f"{len(paths)} queries including a dataset", expected="only the dataset")
             refuse(
                 {"--depth": self.depth, "--focal": self.camera.focal, "--hfov": self.camera.hfov},
                 f"is for photos, but {paths[0]} is a dataset, which has its own; to use its images as photos, name the files",
             )
-            dataset = replace(images, background=background).open(paths[0])
-            return DatasetFrames(dataset, images.split, self.frame, self.window, self.rig)
+            return lambda _, background: DatasetFrames(
+                replace(images, background=background).open(paths[0]), images.split, self.frame, self.window, self.rig
+            )
         if self.window > 1:
             raise UsageError(f"--window {self.window} needs known relative poses", expected="a dataset")
         files = photo_files(paths, self.depth)
+        depth = depth_files(files, self.depth)
         if not self.depth:
             of_depth = {"--depth-unit": images.depth_unit, "--register-depth": images.registration or None}
             refuse(of_depth, "was given without --depth", expected="the depth image that it belongs to")
-        options = replace(images, camera=self.camera.source(images.camera, assumed), background=background)
-        return Photos(files, options, depth_files(files, self.depth))
+        for given in (files, self.depth):
+            if not any(file.exists() for file in given):  # a single one does not stop the others
+                require_inputs(*given)
+        return lambda assumed, background: Photos(
+            files, replace(images, camera=self.camera.source(images.camera, assumed), background=background), depth
+        )
 
 
+QueryOpener: TypeAlias = "Callable[[Sequence[Intrinsics], Background | None], Photos | DatasetFrames]"
+"""Opens queries, given the cameras assumed for photos without any and the background of the map, if there is one map."""
 Queries: TypeAlias = Annotated[QueryOptions, Group("queries", "What is localized, and which depth was measured.")]

@@ -36,6 +36,7 @@ NEGATIVE = re.compile(r"-[\d.]")
 """Matches the beginning of a value such as -1,0,2, which is not an option."""
 ESCAPE = "\0"
 """Precedes words that are no options, though they look like one; arguments of a program cannot contain it."""
+MISSING_ARGUMENTS = "the following arguments are required: "  # argparse's words
 KINDS = {
     int: ("INT", "a whole number"),
     float: ("FLOAT", "a number"),
@@ -216,7 +217,7 @@ class _Parser(argparse.ArgumentParser):
     """The argument parser of a command.
 
     ``loaded`` holds the settings that depend on other arguments. If ``short`` is set, help pages leave out what is rarely needed. If
-    ``options_only`` is set, positional arguments are unknown, and required options may be missing.
+    ``options_only`` is set, positional arguments are unknown.
     """
 
     def __init__(
@@ -238,6 +239,7 @@ class _Parser(argparse.ArgumentParser):
         )
         self._positionals.title = "arguments"
         usage = {True: list[str](), False: list[str]()}  # positional arguments, and required options
+        self._required = dict[str, bool]()  # the arguments in messages, and whether they are options
         groups, others = dict[Group | None, Any](), dict[str, None]()
         groups[None] = self.add_argument_group("options")
         for parameter, group in _leaves(target, loaded):
@@ -249,7 +251,7 @@ class _Parser(argparse.ArgumentParser):
                 if group not in groups:
                     assert group is not None
                     groups[group] = self.add_argument_group(group.title, self._fill(group.text, 2))
-                usage[parameter.option.positional] += self._add(parameter, groups[group], complete=not options_only)
+                usage[parameter.option.positional] += self._add(parameter, groups[group])
         if short and others:
             self.epilog = self._fill(f"'{self.prog} {HELP_ALL}' also describes {enumeration(sorted(others))}.")
         else:
@@ -268,12 +270,14 @@ class _Parser(argparse.ArgumentParser):
         fill = functools.partial(textwrap.fill, width=self.width - indent, break_on_hyphens=False)
         return "\n\n".join(map(fill, paragraphs))
 
-    def _add(self, parameter: Parameter, group: Any, complete: bool) -> list[str]:
+    def _add(self, parameter: Parameter, group: Any) -> list[str]:
         """Add an argument, and return its words in the usage, if any."""
         option, flag, required = parameter.option, parameter.flag, parameter.default is MISSING
         nargs, convert, metavar = conversion(parameter.hint, parameter.notes)
         shown = option.metavar or metavar
         common: dict[str, Any] = {"type": convert, "metavar": shown, "help": parameter.description}
+        if required:
+            self._required[shown if option.positional else flag] = not option.positional
         if option.positional:
             nargs = nargs if required else {None: "?", "+": "*"}[nargs]  # type: ignore[index]
             self.add_argument(parameter.name, nargs=nargs, **common)
@@ -284,9 +288,7 @@ class _Parser(argparse.ArgumentParser):
             return []
         common["metavar"] = tuple(shown.split()) if isinstance(nargs, int) else shown.removesuffix("...")
         action = "extend" if nargs == "+" else "store"
-        group.add_argument(
-            flag, action=action, nargs=nargs, dest=parameter.name, required=required and complete, **common
-        )
+        group.add_argument(flag, action=action, nargs=nargs, dest=parameter.name, **common)
         return [f"{flag} {shown}"] if required else []
 
     def unknown_option(self, words: Sequence[str]) -> str | None:
@@ -298,9 +300,15 @@ class _Parser(argparse.ArgumentParser):
         """Parse words, and return the values of the arguments given, by parameter name. Raises ``UsageError``."""
         self._words = words
         given, more = self.parse_known_intermixed_args(_escape(words))
+        if self._missing_options():
+            self.error(MISSING_ARGUMENTS)
         if more:
             self.error(f"unexpected argument {more[0].removeprefix(ESCAPE)!r}")
         return {name: tuple(value) if isinstance(value, list) else value for name, value in vars(given).items()}
+
+    def _missing_options(self) -> list[str]:
+        given = {word.partition("=")[0] for word in self._words}
+        return [name for name, is_option in self._required.items() if is_option and name not in given]
 
     def error(self, message: str) -> NoReturn:
         """Raise ``UsageError``. An unknown option is reported instead of ``message``, since it explains the other errors."""
@@ -308,10 +316,11 @@ class _Parser(argparse.ArgumentParser):
         message = re.sub(r"^argument \[?([^]: ]+)\S*: ", r"\1 ", message)
         if (name := self.unknown_option(words)) is not None:
             message = f"no option {name!r}{spelling_hint(name, options)}"
-        elif message.startswith("the following") and (
-            lists := [w for w in words if w in options and options[w].nargs == "+"]
-        ):
-            message = f"{message}; {lists[-1]} takes all words after it, so give it last"
+        elif message.startswith(MISSING_ARGUMENTS):
+            missing = [name for name in message.removeprefix(MISSING_ARGUMENTS).split(", ") if name in self._required]
+            lists = [word for word in words if word in options and options[word].nargs == "+" and missing]
+            hint = f"; {lists[-1]} takes all words after it, so give it last" if lists else ""
+            message = f"{MISSING_ARGUMENTS}{', '.join([*missing, *self._missing_options()])}{hint}"
         raise UsageError(f"{message}; '{self.prog} {HELP}' describes all arguments")
 
 
@@ -440,7 +449,8 @@ def conversion(hint: Any, notes: Sequence[Any] = ()) -> tuple[int | str | None, 
                 continue
             for limit in (limit for limit in limits if value not in limit):
                 hint = spelling_hint(word, [*map(str, limit.table)]) if isinstance(limit, OneOf) else ""
-                raise argparse.ArgumentTypeError(f"is {value!r}{hint or f', expected {limit}'}")
+                shown = repr(word) if isinstance(value, str) else word
+                raise argparse.ArgumentTypeError(f"is {shown}{hint or f', expected {limit}'}")
             return value
         raise argparse.ArgumentTypeError(f"is {word!r}{spelling_hint(word, choices, f', expected {expected}')}")
 

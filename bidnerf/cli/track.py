@@ -17,6 +17,7 @@ from bidnerf.cli.options import (
     SeenImages,
     pose_file_help,
     require_device,
+    require_inputs,
     wrong_usage,
 )
 from bidnerf.cli.output import check_output, print_json, print_table, say
@@ -99,6 +100,7 @@ def run_track(
     for file in filter(None, (out, plot)):
         check_output(file, [Path(each) for each in named if isinstance(each, str | Path)], overwrite)
     require_device(device)
+    require_inputs(sequence, tracking.start)
     start = None if tracking.start is None else read_pose(tracking.start)
     with wrong_usage():
         settings = settings_of(USUAL_METHOD, {"depth_sensor": frames.depth_sensor, "risk": tracking.risk})

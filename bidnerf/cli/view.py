@@ -19,6 +19,7 @@ from bidnerf.cli.options import (
     Queries,
     SeenImages,
     require_device,
+    require_inputs,
 )
 from bidnerf.cli.output import check_output, console, say, show
 from bidnerf.cli.parser import Group, Option, Without
@@ -87,6 +88,8 @@ def run_view(
         check_output(page.save, (*query, *queries.depth, page.results, page.trajectory), page.overwrite)
     else:
         viewer.require_viewer()
+    require_inputs(page.results, page.trajectory)
+    opener = queries.opener(query, images) if query else None
     say(f"loading {map}")
 
     from bidnerf.evaluation import read_results
@@ -104,8 +107,8 @@ def run_view(
     localizer = Localizer(scene, server.method, warm_up=page.save is None)
     source = None
     camera = queries.camera.source(images.camera, localizer.assumed_cameras)
-    if query:
-        source = queries.open(query, images, localizer.assumed_cameras, scene.bounds.background)
+    if opener is not None:
+        source = opener(localizer.assumed_cameras, scene.bounds.background)
         camera = CameraSource() if isinstance(source, DatasetFrames) else camera
         if page.save is not None and not queries.frame:  # at most 24 images, spread over all
             source = source.select(range(0, len(source.names), -(-len(source.names) // 24)))

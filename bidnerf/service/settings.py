@@ -22,7 +22,8 @@ class ServiceLimits(Settings):
     A request counts from the moment its head has arrived, so that ``queue`` bounds the memory of uploads too.
     """
 
-    workers: Annotated[int, Range(0, 1000)] = 0  # processes that localize, each with one thread; 0: one per core
+    workers: Annotated[Annotated[int, Range(1, 1000)] | None, "N"] = None
+    """number of single-threaded processes that localize (default: one per core)"""
     queue: Annotated[int, Range(0, 100_000), EXPERT] = (
         16  # requests that may upload or wait besides those at work; further ones get status 429
     )

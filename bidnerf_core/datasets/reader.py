@@ -34,7 +34,10 @@ def read_capture(
     """
     path, or_else = Path(path), ""
     if not path.exists():
-        raise InputError("no such file or folder" if in_time_order else "no such folder", where=path)
+        what, expected = (
+            ("file or folder", "a dataset, images or a video") if in_time_order else ("folder", "a dataset")
+        )
+        raise InputError(f"no such {what}", where=path, expected=expected)
     reader = find_reader(path, readers)
     if reader is None and in_time_order:
         # The readers of photos and videos are not registered: they find no poses.
@@ -48,7 +51,7 @@ def read_capture(
         raise no_dataset(path, readers, or_else)
     source = options.camera_source
     given: list[tuple[OpenQuestion, bool, str]] = [
-        ("camera", source.is_given, "is a dataset with its own cameras; leave out `camera`"),
+        ("camera", source.is_given, "is a dataset with its own cameras; leave out `camera`, `focal` and `hfov`"),
         (
             "register_depth",
             options.registration not in (None, False),

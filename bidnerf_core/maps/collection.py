@@ -15,7 +15,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import unique_names
-from bidnerf_core.errors import InputError, amount
+from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import (
@@ -241,7 +241,7 @@ def name_maps(scenes: Sequence[_Scene]) -> dict[str, _Scene]:
             paths.append((scene.info.backend, scene.info.data or "map"))
         identity = id(scene) if folder is None else paths[-1]
         if identity in known:
-            raise InputError(f"two maps are named {paths[-1][-1]!r}", expected="each map once")
+            raise UsageError(f"two maps are named {paths[-1][-1]!r}", expected="each map once")
         known.add(identity)
     return dict(zip(unique_names(paths, "/"), scenes, strict=True))
 
