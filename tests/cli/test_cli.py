@@ -371,57 +371,7 @@ def test_a_disk_that_fills_up_keeps_the_last_whole_map(bidnerf: Run, shared: Pat
     assert load_map(small_disk / "map").info.complete
 
 
-# Wrong usage.
-
-WRONG_USAGE = """
-    train {data} --out {out} --steps 0
-    train {data} --out {out} --learning-rate nan
-    train {data} --out {out} --checkpoint-every -1
-    train {data} --out {out} --largest 0
-    train {data} --out {out} --backend adanerf --threshold inf
-    train {data} --out {out} --depth-weight inf
-    train {data} --out {out} --points-error inf
-    render {map} --out {out}
-    render {map} {data} --out {out} --level 1.5
-    localize {map}
-    localize {map} {data} --focal 30
-    localize {map} {data} {data}
-    localize {map} x.png --focal 30 --hfov 60
-    localize {map} x.png --focal 30 --window 2
-    localize {map} x.png --focal 30 --perturb 1 2
-    localize {map} x.png --focal 30 --depth a.png b.png
-    localize {map} x.png --focal 30 --out poses.csv
-    localize {map} {data} --frame t_0000 --method guess
-    localize {map} {data} --frame t_0000 --start p.json --perturb 1 2
-    localize {map} {data} --frame t_0000 --perturb 1 2 --seed -1
-    localize {map} {data} --frame t_0000 --perturb 1 2 --seed 999999999999999999999999999999
-    localize {map} {data} --frame t_0000 --perturb 1 2 --method bid --wide nan
-    demo --frames 0 --out {out}
-    demo --steps 0 --out {out}
-    evaluate {map} {data} --out {out} --method guess
-    evaluate {map} {data} --out {out} --protocol guess
-    evaluate {map} {data} --out {out} --size -1
-    evaluate {map} {data} --out {out} --size half
-    evaluate {map} {data} --out {out} --trials 999999999
-    evaluate {map} {data} --out {out} --shards 2 --shard 2
-    evaluate {map} {data} --out {out} --dask tcp://x:1 --workers 2
-    evaluate {map} {data} --out {out} --protocol none --size 1
-    compare {map} {data} --method guess
-    compare {map} {data} --size 0.5:10
-    compare {map} {data} --protocol guess
-    report --out {out}
-    serve {map} --timeout 0
-"""
-
-
-@pytest.mark.parametrize("line", [line.strip() for line in WRONG_USAGE.strip().splitlines()])
-def test_wrong_usage_has_status_2_and_no_output(line: str, bidnerf: Run, shared: Path, tmp_path: Path) -> None:
-    places = {"data": shared / "data", "map": shared / "map", "out": tmp_path / "out"}
-    outcome = bidnerf(*[word.format(**places) for word in line.split()])
-    assert (outcome.status, outcome.out) == (2, "")
-    assert outcome.err
-    assert "Traceback" not in outcome.err
-    assert list(tmp_path.iterdir()) == []
+# Wrong usage, beside ``wrong_arguments.txt``.
 
 
 def test_an_argument_with_a_nul_is_wrong_usage(bidnerf: Run) -> None:

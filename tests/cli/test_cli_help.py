@@ -228,34 +228,6 @@ def test_help_hides_what_experts_need(capsys: pytest.CaptureFixture[str]) -> Non
         assert ("'bidnerf x --help-all' also describes rarely needed options." in page) == (option == "--help")
 
 
-# Arguments that are wrong.
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("train --outt X photos", "no option '--outt', did you mean '--out'?"),
-        ("train d --out x --depth_uni=2", "no option '--depth-uni', did you mean '--depth-unit'?"),
-        ("train d --out x --stepz=2", "no option '--stepz', did you mean '--steps'?"),
-        ("train d", "the following arguments are required: --out"),
-        ("train d --out", "--out expected one argument"),
-        ("train d --out x --steps a", "--steps is 'a', expected a whole number"),
-        ("train d --out x --steps 0", "--steps is 0, expected 1 to 10,000,000"),
-        ("localize m p --window 0 --stepz", "--window is 0, expected a whole number, from 1 up"),
-        ("localize m p --focal=abc", "--focal is 'abc', expected a number"),
-        ("scale m --distance a b", "--distance expected 3 arguments"),
-        ("scale m", "one of --distance, --poses, --factor is missing"),
-        ("scale m --factor 1 --poses x", "--poses and --factor exclude each other"),
-        ("localize m p --mask-hides red", "--mask-hides is 'red', expected one of black, white"),
-        ("info m extra", "unexpected argument 'extra'"),
-    ],
-)
-def test_wrong_arguments_are_told_in_a_line(bidnerf: Run, line: str, message: str) -> None:
-    status, out, err = bidnerf(*line.split())
-    assert (status, out, err.count("\n")) == (2, "", 1)
-    assert err.startswith(f"bidnerf {line.split()[0]}: {message}")
-
-
 def test_values_are_refused_before_settings_are_loaded() -> None:
     """The settings of a method take long to import."""
 
