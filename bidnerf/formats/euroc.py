@@ -22,6 +22,7 @@ from bidnerf_core.datasets import (
     camera_of,
     first_file,
     numbers_in,
+    pixel_size,
     pose_of_matrix,
     read_timed_files,
     read_trajectory,
@@ -69,11 +70,11 @@ def _sensor(file: Path, options: DatasetOptions) -> tuple[CameraSource, SE3]:
     T_body_camera = pose_of_matrix(file, numbers("T_BS", 16), "the rotation of T_BS")
     if options.given_camera is not None:
         return CameraSource(options.given_camera), T_body_camera
-    width, height = numbers("resolution", 2)
+    size = pixel_size(file, numbers("resolution", 2))
     lens, model = numbers("distortion_coefficients", 4), values.get("distortion_model", "unknown")
     if any(lens) and model not in ("radial-tangential", "radtan", "plumb_bob"):
         raise InputError(f"distortion_model is {model}", where=file, expected="radial-tangential; undistort the images")
-    return CameraSource(camera_of(file, numbers("intrinsics", 4), (int(width), int(height)), lens)), T_body_camera
+    return CameraSource(camera_of(file, numbers("intrinsics", 4), size, lens)), T_body_camera
 
 
 reader = Format(

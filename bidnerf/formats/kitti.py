@@ -77,6 +77,8 @@ def _calibration(file: Path, camera: str, size: tuple[int, int]) -> tuple[Intrin
         name, _, text = row.text.partition(":")
         if name.strip() == camera:
             projection = torch.tensor(row.numbers(text.split(), 12), dtype=torch.float64).reshape(3, 4)
+            if not abs(float(torch.linalg.det(projection[:, :3]))) > 0:
+                raise row.error(": the matrix projects no image")
             shift = torch.linalg.solve(projection[:, :3], projection[:, 3])
             numbers = [float(projection[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
             return camera_of(row.where, numbers, size), SE3(torch.eye(3, dtype=torch.float64), -shift)

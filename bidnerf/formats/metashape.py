@@ -24,12 +24,13 @@ from bidnerf_core.datasets import (
     Shot,
     camera_of,
     numbers_in,
+    pixel_size,
     pose_of_matrix,
 )
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import natural_order
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import is_file, read_file
+from bidnerf_core.io import is_file, parse_xml, read_file
 
 
 def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
@@ -77,13 +78,8 @@ def _find(path: Path) -> Path | None:
 
 def _chunk(file: Path) -> ElementTree.Element:
     """Return the first chunk. Raises ``InputError`` for invalid XML, and for XML entities, whose expansion may be unbounded."""
-    content, expected = read_file(file, "cameras of Metashape"), "cameras exported by Metashape"
-    if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
-        raise InputError("declares a document type", where=file, expected=expected)
-    try:
-        chunk = ElementTree.fromstring(content).find("chunk")
-    except (ElementTree.ParseError, ValueError) as error:
-        raise InputError(f"is no XML ({error})", where=file, expected=expected) from error
+    expected = "cameras exported by Metashape"
+    chunk = parse_xml(read_file(file, expected), str(file), expected).find("chunk")
     if chunk is None:
         raise InputError("has no chunk", where=file, expected=expected)
     return chunk
@@ -95,10 +91,8 @@ def _camera(sensor: ElementTree.Element, where: str) -> Camera | None:
     adjusted = [each for each in found if each.get("class") in ("adjusted", None)][-1:] or found[:1]
     if size is None:
         return None
-    sides = [size.get(side) or "" for side in ("width", "height")]
-    if not all(side.isdecimal() for side in sides):
-        raise InputError(f"its resolution is {' x '.join(sides)}", where=where, expected="whole numbers of pixels")
-    width, height = map(int, sides)
+    sides = " ".join(size.get(side) or "" for side in ("width", "height"))
+    width, height = pixel_size(where, numbers_in(f"{where}: its resolution", sides, 2))
     if sensor.get("type") == "spherical":
         return PanoramaFace("front", (width, height))
     if not adjusted:

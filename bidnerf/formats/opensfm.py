@@ -31,7 +31,7 @@ from bidnerf_core.datasets import (
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import natural_order
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import Record, read_json
+from bidnerf_core.io import Record, is_file, read_json
 
 KINDS = ("perspective", "brown", "simple_radial", "radial", "fisheye_opencv")
 """The projection types that are read, besides panoramas."""
@@ -51,12 +51,19 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
         warn_about(file, f"has {len(parts)} reconstructions, of which the one with {len(entries)} images is used")
     others = ("images", "opensfm/images", ".", "../images")
     names, shots = FileNames(*(path / place for place in others)), list[Shot]()
+    known = dict[str, Camera]()
     for name in sorted(entries, key=natural_order):
-        where, entry = f"{file}: {name}", entries[name]
+        where, entry, image = f"{file}: {name}", entries[name], names.path(name, IMAGE_ENDINGS)
+        if not is_file(image):
+            shots.append(Shot(image=image))
+            continue
         record = Record(where, entry if isinstance(entry, dict) else {})
-        own = cameras.get(str(record.value("camera"))) if isinstance(cameras, dict) else None
+        key = str(record.value("camera"))
+        own = cameras.get(key) if isinstance(cameras, dict) else None
         if not isinstance(own, dict):
-            raise record.error(f"has the camera {record.value('camera')!r}", expected="one of cameras")
+            raise record.error(f"has the camera {key[:60]!r}", expected="one of cameras")
+        if key not in known:
+            known[key] = _camera(Record(f"{where}: camera", own))
         turn, position = (
             [record.checked_number(n, key) for n in record.items(key) or []] for key in ("rotation", "translation")
         )
@@ -66,8 +73,8 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
         T_camera_world = SE3(rotation, torch.tensor(position, dtype=torch.float64))
         shots.append(
             Shot(
-                image=names.path(name, IMAGE_ENDINGS),
-                camera=_camera(Record(f"{where}: camera", own)),
+                image=image,
+                camera=known[key],
                 T_world_camera=T_camera_world.inverse(),
                 time=record.number("capture_time") or None,  # 0 where a photo does not record it
             )

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from bidnerf.formats.seven_scenes import frames_of, images_of
 from bidnerf_core.camera import CameraSource, Intrinsics
-from bidnerf_core.datasets import Capture, DatasetOptions, Format, Shot, camera_of, first_file
+from bidnerf_core.datasets import Capture, DatasetOptions, Format, Shot, camera_of, first_file, numbers_in, pixel_size
 from bidnerf_core.depth import MILLIMETRE, DepthCamera, DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
@@ -71,7 +71,7 @@ def _camera(info: Path, values: dict[str, list[float]], kind: str) -> Intrinsics
         return None
     row = 4 if len(matrix) == 16 else 3
     numbers = matrix[0], matrix[row + 1], matrix[2], matrix[row + 2]
-    return camera_of(info, numbers, (int(size[0][0]), int(size[1][0])))
+    return camera_of(info, numbers, pixel_size(info, [size[0][0], size[1][0]]))
 
 
 def _in_splits(path: Path, shots: list[Shot]) -> list[Shot]:
@@ -84,9 +84,9 @@ def _in_splits(path: Path, shots: list[Shot]) -> list[Shot]:
     first = next((found for found in ranges if found is not None), None)
     if first is None:
         raise InputError("has no [start=0 ; end=356]", where=file, expected="the frames of each sequence")
-    test = range(int(first[1]), int(first[2]) + 1)
+    start, end = numbers_in(file, f"{first[1]} {first[2]}", 2)
     return [
-        replace(shot, splits=("test" if int(shot.stem.partition("-")[2]) in test else "train",))
+        replace(shot, splits=("test" if start <= float(shot.stem.partition("-")[2]) <= end else "train",))
         if shot.T_world_camera
         else shot
         for shot in shots

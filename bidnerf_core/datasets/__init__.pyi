@@ -24,6 +24,7 @@ from .options import AS_STORED as AS_STORED
 from .options import DatasetOptions as DatasetOptions
 from .options import DepthRegistration as DepthRegistration
 from .pose_rows import camera_of as camera_of
+from .pose_rows import pixel_size as pixel_size
 from .pose_rows import pose_of_rows as pose_of_rows
 from .queries import DatasetFrames as DatasetFrames
 from .queries import Photos as Photos

@@ -14,16 +14,13 @@ matched; COLMAP's scale is half of our diameter. The centre of the first pixel i
 
 from __future__ import annotations
 
-import contextlib
 import io
-import sqlite3
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeAlias
-from urllib.parse import quote
 
 import numpy as np
 import torch
@@ -35,7 +32,7 @@ from bidnerf_core.camera import MODELS, Camera, colmap_camera, read_text_cameras
 from bidnerf_core.depth import DepthImage, depth_image
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import is_file, read_file, read_lines
+from bidnerf_core.io import is_file, open_arrays, read_file, read_lines, read_table
 from bidnerf_core.mapping import FIRST_CENTRE, Keypoints, quantize
 
 MODEL_FILE = "a file of a COLMAP sparse model"
@@ -238,43 +235,54 @@ def _text(path: Path, columns: _Columns) -> Iterator[_Entry]:
         yield row.where, numbers, name, column
 
 
-def stored_keypoints(path: Path) -> Iterator[tuple[str, Keypoints]]:
-    """Yield the name and keypoints of each image in a database or (with the extension .h5) a feature file.
+def stored_keypoints(path: Path, names: Iterable[str]) -> dict[str, Keypoints]:
+    """Return the keypoints of those of the images ``names`` that a database or (with the extension .h5) a feature file knows.
 
     Raises ``InputError`` for a file that cannot be read, and if h5py, required for hloc features, is not installed.
     """
-    for name, pixels, scales, descriptors in (_of_features if path.suffix == ".h5" else _of_database)(path):
-        count = len(pixels)
-        if not (len(scales) == len(descriptors) == count and np.isfinite(pixels).all() and (scales > 0).all()):
+    found = dict[str, Keypoints]()
+    for name, pixels, scales, descriptors in (_of_features if path.suffix == ".h5" else _of_database)(path, names):
+        count, arrays = len(pixels), (pixels, scales, descriptors)
+        ranks = pixels.ndim == descriptors.ndim == 2 and pixels.shape[1] >= 2
+        if not (ranks and scales.shape == (count,) and len(descriptors) == count):
             raise InputError(
-                f"image {name!r} has {count} keypoints, {len(scales)} scales and {len(descriptors)} descriptors",
+                f"image {name!r} has {', '.join(str(list(array.shape)) for array in arrays)} numbers",
                 where=path,
-                expected="finite numbers for each keypoint",
+                expected=f"{count} keypoints (x, y), scales and descriptors",
             )
+        if not (all(bool(np.isfinite(array).all()) for array in arrays) and (scales > 0).all()):
+            raise InputError(f"image {name!r} has keypoints of NaN", where=path, expected="finite numbers")
         # OpenCV's diameter of a keypoint is twice the scale of the Gaussian at which it was found.
         sizes = torch.from_numpy(2 * np.asarray(scales, dtype=np.float32))
         numbers = torch.from_numpy(np.array(descriptors))
         if numbers.dtype != torch.uint8:
             numbers = quantize(numbers.float())
-        yield name, Keypoints(torch.from_numpy(np.array(pixels, dtype=np.float32)), sizes, numbers)
+        found[name] = Keypoints(torch.from_numpy(np.array(pixels[:, :2], dtype=np.float32)), sizes, numbers)
+    return found
 
 
-def _of_database(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
-    query = (
-        "SELECT name, k.rows, k.cols, k.data, d.rows, d.cols, d.data FROM images"
-        " JOIN keypoints AS k ON k.image_id = images.image_id JOIN descriptors AS d ON d.image_id = images.image_id"
-    )
-    try:  # immutable: nothing is written beside the file
-        address = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
-        with contextlib.closing(sqlite3.connect(address, uri=True)) as opened:
-            for name, *found in opened.execute(query):
-                keypoints, descriptors = (
-                    np.frombuffer(data or b"", kind).reshape(rows, columns)
-                    for (rows, columns, data), kind in zip((found[:3], found[3:]), ("<f4", "u1"), strict=True)
+_Stored: TypeAlias = Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]
+"""The names of images with their keypoints, scales and descriptors."""
+
+
+def _of_database(path: Path, names: Iterable[str]) -> _Stored:
+    expected, columns, known = "a database of COLMAP", ("image_id", "rows", "cols", "data"), set(names)
+    by_number = {
+        number: name for number, name in read_table(path, "images", ("image_id", "name"), expected) if name in known
+    }
+    keypoints = {
+        number: row for number, *row in read_table(path, "keypoints", columns, expected) if number in by_number
+    }
+    for number, *row in read_table(path, "descriptors", columns, expected):
+        if number in keypoints:
+            try:
+                of_image, descriptors = (
+                    np.frombuffer(data or b"", kind).reshape(rows, count)
+                    for (rows, count, data), kind in ((keypoints[number], "<f4"), (row, "u1"))
                 )
-                yield str(name), keypoints[:, :2], _scales(keypoints), descriptors
-    except (sqlite3.Error, ValueError, TypeError) as error:
-        raise InputError(f"cannot be read: {error}", where=path, expected="a database of COLMAP") from error
+            except (ValueError, TypeError) as error:
+                raise InputError(f"image {by_number[number]!r}: {error}", where=path, expected=expected) from error
+            yield by_number[number], of_image, _scales(of_image), descriptors
 
 
 def _scales(keypoints: np.ndarray) -> np.ndarray:
@@ -287,25 +295,11 @@ def _scales(keypoints: np.ndarray) -> np.ndarray:
     return np.full(len(keypoints), UNKNOWN_SCALE, dtype=np.float32)
 
 
-def _of_features(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
-    try:
-        import h5py
-    except ImportError as error:
-        raise InputError("features of hloc need h5py (pip install h5py)", where=path) from error
-
-    def images(group: Any, parents: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
-        """Yield the groups that contain keypoints; folders in an image name are nested groups."""
-        if "keypoints" in group:
-            yield str(PurePosixPath(*parents)), group
-            return
-        for name in group:
-            yield from images(group[name], (*parents, name))
-
-    try:
-        with h5py.File(path, "r") as opened:
-            for name, group in images(opened, ()):
-                pixels = np.asarray(group["keypoints"], dtype=np.float32)[:, :2] + FIRST_CENTRE
-                scales = np.asarray(group["scales"]) if "scales" in group else np.full(len(pixels), UNKNOWN_SCALE)
-                yield name, pixels, scales, np.asarray(group["descriptors"], dtype=np.float32).T
-    except (OSError, KeyError, ValueError, IndexError, TypeError) as error:
-        raise InputError(f"cannot be read: {error}", where=path, expected="features of hloc") from error
+def _of_features(path: Path, names: Iterable[str]) -> _Stored:
+    with open_arrays(path, "features of hloc") as read:
+        for name in names:
+            parts = PurePosixPath(name).parts  # folders in an image name are nested groups
+            pixels, scales, descriptors = (read(*parts, key) for key in ("keypoints", "scales", "descriptors"))
+            if pixels is not None and descriptors is not None:
+                scales = np.full(len(pixels), UNKNOWN_SCALE) if scales is None else scales
+                yield name, pixels + np.float32(FIRST_CENTRE), scales, descriptors.T.astype(np.float32)

@@ -6,8 +6,8 @@ path from another machine. The file is found anyway if the name is unambiguous.
 
 from __future__ import annotations
 
+import os
 from collections import Counter
-from itertools import chain
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from bidnerf_core.io import HEIF_SUFFIXES, IMAGE_SUFFIXES, is_file
@@ -28,7 +28,7 @@ class FileNames:
 
     def __init__(self, folder: Path, *others: Path) -> None:
         self._folders = [each for each in (folder, *others) if each == folder or each.is_dir()]
-        self._listed: dict[Path, dict[str, str]] = {}
+        self._listed: dict[Path, tuple[set[str], dict[str, str]]] = {}
 
     def find(self, name: str | PurePosixPath, endings: tuple[str, ...] = ("",), moved: bool = False) -> Path | None:
         """Return the file named ``name`` plus one of the ``endings``, or None.
@@ -42,30 +42,34 @@ class FileNames:
         last = len(name.parts) if is_absolute or moved else min(1, len(name.parts))
         tails = [name.parts[first:] for first in range(int(is_absolute), last)]
         for folder in self._folders:
-            exact = (folder / f"{name}{ending}" for ending in endings)
-            like = (
-                self._ignoring_case(folder, (*parts[:-1], f"{parts[-1]}{ending}"))
-                for parts in tails
-                for ending in endings
-            )
-            for file in chain(exact, like):
-                if is_file(file):
-                    return file
+            parent = folder / name.parent if len(name.parts) > 1 else folder
+            exact, like = (parent, name.name), ((self._on_disk(folder, t[:-1]), t[-1]) for t in tails)
+            for number, (parent, last) in enumerate((exact, *like)):
+                # Most names of a large file may be missing, so folders are listed instead of trying each ending.
+                exact_names, unique = self._names(parent)
+                for wanted in (f"{last}{ending}" for ending in endings):
+                    found = unique.get(wanted.lower(), wanted) if number else wanted
+                    if found in exact_names and is_file(file := parent / found):
+                        return file
         return None
 
     def path(self, name: str | PurePosixPath, endings: tuple[str, ...] = ("",), moved: bool = False) -> Path:
         """Return the file that ``find`` returns or, if there is none, the path where it is expected."""
         return self.find(name, endings, moved) or self._folders[0] / posix_name(str(name))
 
-    def _ignoring_case(self, folder: Path, parts: tuple[str, ...]) -> Path:
+    def _on_disk(self, folder: Path, parts: tuple[str, ...]) -> Path:
         """Return the path of ``parts`` below a folder, each with the upper and lower case used on disk unless that is ambiguous."""
         for part in parts:
-            if folder not in self._listed:
-                try:
-                    names = [child.name for child in folder.iterdir()]
-                except OSError:
-                    names = []
-                count = Counter(name.lower() for name in names)
-                self._listed[folder] = {name.lower(): name for name in names if count[name.lower()] == 1}
-            folder = folder / (part if part == ".." else self._listed[folder].get(part.lower(), part))
+            folder = folder / (part if part == ".." else self._names(folder)[1].get(part.lower(), part))
         return folder
+
+    def _names(self, folder: Path) -> tuple[set[str], dict[str, str]]:
+        """Return the names in a folder, and those that are unambiguous by their lower case."""
+        if folder not in self._listed:
+            try:
+                names = os.listdir(folder)
+            except (OSError, ValueError):
+                names = []
+            count = Counter(name.lower() for name in names)
+            self._listed[folder] = set(names), {n.lower(): n for n in names if count[n.lower()] == 1}
+        return self._listed[folder]

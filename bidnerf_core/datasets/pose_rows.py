@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.errors import errors_in
+from bidnerf_core.errors import InputError, errors_in
 from bidnerf_core.geometry import RIGID_TO, SE3, rigid_pose
 from bidnerf_core.io import Record
 
@@ -33,6 +33,18 @@ def camera_of(
     fx, fy, cx, cy = numbers
     with errors_in(where):
         return Intrinsics(fx, fy, cx + first_centre, cy + first_centre, *size, tuple(lens) if any(lens) else ())
+
+
+def pixel_size(where: str | Path, numbers: Sequence[float]) -> tuple[int, int]:
+    """Return the width and height of an image. Raises ``InputError`` unless both are positive whole numbers below 10 million."""
+    if not all(1 <= number < 10_000_000 and number == int(number) for number in numbers):
+        raise InputError(
+            f"its size is {' x '.join(f'{number:g}' for number in numbers)}",
+            where=where,
+            expected="whole numbers of pixels",
+        )
+    width, height = map(int, numbers)
+    return width, height
 
 
 def pose_and_scale(record: Record, key: str = "transform_matrix") -> tuple[SE3, float]:

@@ -112,9 +112,9 @@ def _timed_rows(rows: Sequence[Row], path: Path, columns: str, nanoseconds: bool
         try:
             time = float(stamp)
         except ValueError as error:
-            raise row.error(f": {stamp!r} is not a time stamp") from error
+            raise row.error(f": {stamp[:60]!r} is not a time stamp") from error
         if not math.isfinite(time):
-            raise row.error(f": the time stamp is {stamp}")
+            raise row.error(f": the time stamp is {stamp[:60]}")
         if stamp.isdecimal() and (nanoseconds or time >= LEAST_NANOSECONDS):
             time = int(stamp) / NANOSECONDS
         timed.append(TimedRow(row, time, words))
@@ -258,13 +258,18 @@ def pose_of_numbers(where: str, numbers: Sequence[float], opengl: bool) -> SE3 |
 
 
 def numbers_in(where: object, text: str, count: int) -> list[float]:
-    """Return the numbers in a text, separated by spaces or commas. Raises ``InputError`` unless there are ``count`` of them."""
+    """Return the numbers in a text, separated by spaces or commas.
+
+    Raises ``InputError`` unless there are ``count`` of them, all finite.
+    """
     try:
         numbers = [float(word) for word in text.replace(",", " ").split()]
     except ValueError as error:
         raise InputError(error, where=where, expected=f"{count} numbers") from error
     if len(numbers) != count:
         raise InputError(f"has {len(numbers)} numbers", where=where, expected=f"{count}")
+    if not all(map(math.isfinite, numbers)):
+        raise InputError(f"{text.strip()[:60]!r} is not finite", where=where, expected=f"{count} numbers")
     return numbers
 
 

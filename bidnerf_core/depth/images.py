@@ -62,7 +62,7 @@ def read_depth_image(path: Path, unit: float | None) -> DepthImage:
 
     Raises ``InputError`` if the file holds neither.
     """
-    raw = read_array(path, "a .npy file") if path.suffix.lower() == ".npy" else decode(path)
+    raw = read_array(path, "a .npy file") if path.suffix.lower() == ".npy" else decode(path, 24)
     return depth_image(raw, unit, f"{path}: depth")
 
 

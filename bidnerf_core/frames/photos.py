@@ -69,4 +69,5 @@ def _is_photo(file: Path) -> bool:
 def natural_order(name: str) -> list[tuple[int, str]]:
     """Return a sort key that ignores case and compares runs of digits as numbers."""
     parts = re.split(r"(\d+)", name.lower())
-    return [(int(part), "") if number % 2 else (-1, part) for number, part in enumerate(parts)]
+    # No file name has more digits, but a name in a file may have more than Python converts.
+    return [(int(part[:255]), "") if number % 2 else (-1, part) for number, part in enumerate(parts)]

@@ -1,4 +1,7 @@
+from .allowance import Allowance as Allowance
 from .archives import Archive as Archive
+from .databases import open_arrays as open_arrays
+from .databases import read_table as read_table
 from .files import FileInUse as FileInUse
 from .files import PackedFile as PackedFile
 from .files import available_memory as available_memory
@@ -43,6 +46,7 @@ from .json import expected_kinds as expected_kinds
 from .json import from_plain as from_plain
 from .json import parse_json as parse_json
 from .json import parse_record as parse_record
+from .json import parse_xml as parse_xml
 from .json import parse_yaml as parse_yaml
 from .json import read_json as read_json
 from .json import read_record as read_record

@@ -8,10 +8,9 @@ from functools import partial
 from pathlib import Path
 
 from bidnerf_core.errors import InputError, amount
+from bidnerf_core.io.allowance import Allowance
 from bidnerf_core.io.files import PackedFile, open_binary
 
-LARGEST_MEMBER = 256 * 2**20
-"""Default limit on the unpacked size of a member (bytes). A small archive can hold members that unpack to any size."""
 DAMAGES = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError, OSError)
 """Exceptions that the standard library raises for archives that are damaged or of an unsupported kind."""
 
@@ -19,9 +18,9 @@ DAMAGES = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueE
 class Archive:
     """The members of a zip archive by name. Raises ``InputError`` if the file is not a complete zip archive."""
 
-    def __init__(self, path: Path, expected: str = "a zip archive", largest_member: int = LARGEST_MEMBER) -> None:
-        """Open the archive at ``path``. ``largest_member`` limits the unpacked size of a member (bytes)."""
-        self.path, self._expected, self._largest = path, expected, largest_member
+    def __init__(self, path: Path, expected: str = "a zip archive") -> None:
+        """Open the archive at ``path``; ``expected`` briefly describes it."""
+        self.path, self._expected = path, expected
         with open_binary(path, expected) as file:
             begins = file.read(2)
         try:
@@ -57,12 +56,8 @@ class Archive:
         where, member = f"{self.path}/{name}", self._members.get(name)
         if member is None:
             raise InputError(f"not found in the archive, which holds {amount(len(self._members), 'file')}", where=where)
+        Allowance.of(self.path, self._expected, where).take(member.file_size)
         try:
-            with self._zip.open(member) as file:
-                content = file.read(min(member.file_size, self._largest) + 1)
+            return self._zip.read(member)  # no more than it declares
         except (*DAMAGES, RuntimeError) as error:
             raise InputError(f"cannot be unpacked ({error})", where=where, expected=self._expected) from error
-        if max(member.file_size, len(content)) > self._largest:
-            found, most = (f"{size / 2**20:,.0f} MiB" for size in (member.file_size, self._largest))
-            raise InputError(f"unpacks to {found}", where=where, expected=f"at most {most}")
-        return content

@@ -19,6 +19,7 @@ from PIL import Image, TiffImagePlugin, UnidentifiedImageError, WebPImagePlugin 
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.io.allowance import Allowance
 from bidnerf_core.io.files import PackedFile, open_binary, reason
 
 Background: TypeAlias = str | Sequence[float]
@@ -79,6 +80,7 @@ def read_image(
     rgb, alpha = list[Tensor](), list[Tensor]()
     with open_image(path) as image:
         width, height = image.size if size is None else size
+        Allowance.of(path, "an image").take(16 * width * height)  # the bytes and the numbers of a pixel
         if image.mode == "F":  # such as depth
             raise InputError(
                 "image is of float32", where=path, expected="grey, RGB or RGBA with 8 or 16 bits per channel"
@@ -201,12 +203,14 @@ def resample_nearest(image: Shaped[Tensor, "h w"], width: int, height: int) -> S
     return image[rows][:, columns]
 
 
-def decode(path: ImageSource) -> np.ndarray:
+def decode(path: ImageSource, pixel: int = 16) -> np.ndarray:
     """Decode the first image of a file as stored: (h, w) or (h, w, channels) in the file's own type.
 
-    Raises ``InputError`` if the file is not a complete image, and for colour spaces other than grey and RGB.
+    ``pixel`` is the number of bytes that the caller needs for each pixel. Raises ``InputError`` if the file is not a complete
+    image, for colour spaces other than grey and RGB, and if the pixels take too much memory (see ``Allowance``).
     """
     with open_image(path) as image:
+        Allowance.of(path, "an image").take(pixel * image.width * image.height)
         return _pixels(path, image)
 
 

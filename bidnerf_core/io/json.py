@@ -1,5 +1,5 @@
 """JSON: one parser, objects with typed access to values, and conversion of frozen dataclasses to and from
-plain values; and the YAML of calibrations.
+plain values; and the YAML and XML of calibrations and cameras.
 
 All code that reads JSON uses ``parse_json``, so that damaged text of any origin gives the same one-line error.
 """
@@ -20,9 +20,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar, cast
 
 from bidnerf_core.errors import InputError, spelling_hint
+from bidnerf_core.io.allowance import Allowance
 from bidnerf_core.io.files import read_file, reason
 
 if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
+
     from pydantic import TypeAdapter
     from torch import Tensor
 
@@ -44,6 +47,8 @@ EXPECTED = {
     "sequence_str": "a list, such as [{input!r}]",
 }
 """What messages state as expected, by pydantic's error type; other types use pydantic's own text."""
+BYTES = {"{": 240, "[": 64, ",": 40}
+"""The memory that an object, a list and a value take, by the character that stands for one."""
 NOT_ALLOWED = "not_allowed"
 """The error type of values that an annotation of ``settings.Allowed`` refuses."""
 
@@ -59,8 +64,10 @@ def parse_json(content: bytes | str, where: str, expected: str) -> Any:
     The message begins with ``where`` (the file, or nothing) and ends with ``expected``, a brief description of what should
     be there.
     """
+    allowance = Allowance(where, expected, 2**30)
     try:
         text = content.decode("utf-8-sig") if isinstance(content, bytes) else content
+        allowance.take(sum(bytes * text.count(mark) for mark, bytes in BYTES.items()))
         found = json.loads(text)
         if "\\ud" in text.lower():  # half of a surrogate pair, which no file or terminal can represent
             json.dumps(found, ensure_ascii=False).encode()
@@ -68,6 +75,8 @@ def parse_json(content: bytes | str, where: str, expected: str) -> Any:
         raise InputError(
             f"not JSON ({error.msg} at line {error.lineno}, column {error.colno})", where=where, expected=expected
         ) from error
+    except InputError:
+        raise
     except (ValueError, RecursionError) as error:
         raise InputError(f"not JSON ({error})", where=where, expected=expected) from error
     return found
@@ -347,3 +356,32 @@ def parse_yaml(content: bytes, where: str, expected: str) -> Any:
         return next(iter(yaml.load_all(text, Loader=loader)), None)
     except (UnicodeDecodeError, yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         raise InputError(f"is not YAML ({reason(error)})", where=where, expected=expected) from error
+
+
+def parse_xml(content: bytes, where: str, expected: str) -> Element:
+    """Return the root element of an XML text. Raises ``InputError``, whose message begins with ``where``, if the text is malformed,
+    too large, or declares a document type, whose entities expand to any size.
+    """
+    from xml.etree import ElementTree  # imported here, since few commands read XML
+    from xml.parsers import expat
+
+    most = 4_000_000  # tags: 300 bytes for each element and its end
+
+    def refuse(*_: object) -> None:
+        raise InputError("declares a document type", where=where, expected=expected)
+
+    def begin(*_: object) -> None:
+        raise StopIteration
+
+    if content.count(b"<") > most:
+        raise InputError(f"has more than {most:,} tags", where=where, expected=f"{expected} of fewer")
+    prolog = expat.ParserCreate()
+    prolog.StartDoctypeDeclHandler, prolog.StartElementHandler = refuse, begin
+    try:
+        with contextlib.suppress(StopIteration):
+            prolog.Parse(content, True)
+        return ElementTree.fromstring(content)
+    except InputError:
+        raise
+    except (expat.ExpatError, ElementTree.ParseError, ValueError) as error:
+        raise InputError(f"is no XML ({reason(error)})", where=where, expected=expected) from error

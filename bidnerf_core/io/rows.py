@@ -14,7 +14,7 @@ LARGEST_ROWS = 256 * 2**20
 """Default limit on the size of a file (bytes), about that of a trajectory over a whole day at 100 Hz."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Row:
     """A line of a text file, stripped of leading and trailing white space."""
 

@@ -189,7 +189,12 @@ def read_saved(path: Path, expected: str, mapped: bool = False) -> Any:
             where=path,
             expected=expected,
         ) from error
-    tensors = (leaf for leaf in tree_leaves(content) if isinstance(leaf, Tensor))
+    try:
+        tensors = [leaf for leaf in tree_leaves(content) if isinstance(leaf, Tensor)]
+    except RecursionError as error:
+        raise InputError(
+            "contains itself, or too many parts within each other;", where=path, expected=expected
+        ) from error
     for tensor in () if mapped else tensors:  # those that stay in the file take no memory
         needed = tensor.numel() * tensor.element_size()
         stored = tensor.untyped_storage().nbytes() if tensor.layout is torch.strided else 0

@@ -63,8 +63,9 @@ class StructureImporter:
         beside = (folder / "database.db" for folder in (model, model.parent, model.parent.parent))
         source = given or next((file for file in beside if file.is_file()), None)
         if source is not None and config.keypoints != "photos":
-            stored = dict(stored_keypoints(source))
-            why = _misfit(stored, {i.name: len(i.observed) for i in images}, [s.camera for s in shots])
+            counts = {image.name: len(image.observed) for image in images}
+            stored = stored_keypoints(source, counts)
+            why = _misfit(stored, counts, [s.camera for s in shots])
             if why is None:
                 known = stored
             elif given is not None:

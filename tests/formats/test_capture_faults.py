@@ -20,10 +20,8 @@ import pytest
 from PIL import Image
 
 # Inside: the limit of a member, which a small archive exceeds
-from bidnerf.formats import record3d
 from bidnerf_core.datasets import open_dataset, open_sequence
 from bidnerf_core.errors import InputWarning
-from bidnerf_core.io import Archive
 from refusals import refused
 from scan_layouts import (
     LAYOUTS,
@@ -346,8 +344,8 @@ def test_an_archive_that_is_cut_or_none_or_empty(tmp_path: Path) -> None:
 def test_members_that_unpack_to_too_much(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The size that the archive states is checked first, and what comes out of it as well."""
     file = packed(tmp_path, {**record3d_files(small_views(2)), "metadata": bytes(10**6)}, zipfile.ZIP_DEFLATED)
-    monkeypatch.setattr(record3d, "Archive", partial(Archive, largest_member=10**5))
-    with refused(where=file / "metadata", found="unpacks to 1 MiB", expected="at most 0 MiB"):
+    monkeypatch.setattr("bidnerf_core.io.allowance.FREE", 10**5)
+    with refused(where=file / "metadata", found="unpacks to 1 MiB", expected="at most 0 MiB in memory"):
         read_all(file)
     content = file.read_bytes().replace((10**6).to_bytes(4, "little"), (10**4).to_bytes(4, "little"))
     file.write_bytes(content)

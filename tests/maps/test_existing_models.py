@@ -5,10 +5,11 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import logging
+import re
 import shutil
 import sqlite3
 import sys
-import types
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -141,7 +142,7 @@ def test_an_affine_shape_has_the_scale_of_a_circle_of_its_area(shape: tuple[floa
         torch.zeros((2, 128), dtype=torch.uint8),
     )
     Model(tmp_path, [], [keypoints]).write_database(tmp_path / "database.db", shape=shape)
-    ((_, found),) = stored_keypoints(tmp_path / "database.db")
+    (found,) = stored_keypoints(tmp_path / "database.db", ["000.png"]).values()
     torch.testing.assert_close(found.sizes, keypoints.sizes)
     assert torch.equal(found.pixels, keypoints.pixels)
 
@@ -196,31 +197,114 @@ def test_keypoints_of_another_model_are_not_used(
         bn.import_map(model.folder, None, {"keypoints": str(tmp_path / "other.db")})
 
 
+def write_features(path: Path, keypoints: Sequence[Keypoints], channels: int = 128) -> None:
+    """Write features as hloc does."""
+    h5py = pytest.importorskip("h5py", reason="h5py is not installed")
+    with h5py.File(path, "w") as opened:
+        for number, found in enumerate(keypoints):
+            group = opened.create_group(f"{number:03d}.png")
+            group["keypoints"], group["scales"] = (found.pixels - 0.5).numpy(), (found.sizes / 2).numpy()
+            group["descriptors"] = (found.descriptors.float() / 512).T.numpy()[:channels]
+
+
 def test_features_of_hloc_are_read_with_their_detector(
     model: Model, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """h5py itself is not needed for the test: its files are mappings of mappings."""
     file = tmp_path / "features.h5"
     file.write_bytes(b"")
-    with refused(where="features.h5", found="need h5py"):
-        monkeypatch.setitem(sys.modules, "h5py", None)
+    with refused(where="features.h5", found="need h5py"), monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "h5py", None)
         bn.import_map(model.folder, None, {"keypoints": str(file)})
-    groups: dict[str, Any] = {
-        f"{number:03d}.png": {
-            "keypoints": (found.pixels - 0.5).numpy(),
-            "scales": (found.sizes / 2).numpy(),
-            "descriptors": (found.descriptors.float() / 512).T.numpy(),
-        }
-        for number, found in enumerate(model.keypoints)
-    }
-    fake = types.SimpleNamespace(File=lambda path, mode: contextlib.nullcontext(groups))
-    monkeypatch.setitem(sys.modules, "h5py", fake)
+    write_features(file, model.keypoints)
     scene = bn.import_map(model.folder, None, {"keypoints": str(file)})
     assert error_of(bn.Localizer(scene, warm_up=False)(unseen()), UNSEEN) < 0.01
-    for group in groups.values():
-        group["descriptors"] = group["descriptors"][:64]
+    write_features(file, model.keypoints, 64)
     with refused(found="its descriptors have 64 channels, those of 'sift' 128"):
         bn.import_map(model.folder, None, {"keypoints": str(file)})
+
+
+VIEW = "CREATE VIEW {} AS SELECT 0 image_id, 56250000 rows, 4 cols, zeroblob(900000000) data"
+ENDLESS = (
+    "CREATE VIEW images AS WITH RECURSIVE c(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM c)"
+    " SELECT 0 image_id, '000.png' name FROM c WHERE n < 0"
+)
+DATABASES = {
+    "ALTER TABLE images RENAME TO other; " + ENDLESS: "its 'images' is a view",
+    "DROP TABLE keypoints; " + VIEW.format("keypoints"): "its 'keypoints' is a view",
+    "DROP TABLE descriptors; CREATE VIRTUAL TABLE descriptors USING fts5(image_id, rows, cols, data)": "is a view",
+    "ALTER TABLE images ADD COLUMN more AS (zeroblob(900000000))": "",  # which nobody reads
+    "DROP TABLE images; CREATE TABLE images (image_id, name AS (zeroblob(900000000)));"
+    "INSERT INTO images VALUES (0)": "too big",
+    "UPDATE keypoints SET cols = 0, data = x''": "keypoints (x, y)",
+    "UPDATE keypoints SET rows = 'many'": "image '000.png'",
+    "UPDATE descriptors SET rows = 9223372036854775807": "image '000.png'",
+    "DROP TABLE descriptors": "no such table",
+}
+
+
+@pytest.mark.parametrize("change", DATABASES)
+def test_a_database_is_only_what_it_stores(model: Model, change: str) -> None:
+    """Views, generated columns and virtual tables compute values of any size, and types are those of each value."""
+    file = model.folder / "other.db"
+    model.write_database(file)
+    with contextlib.closing(sqlite3.connect(file)) as opened, opened:
+        opened.executescript(change)
+    if not DATABASES[change]:
+        assert len(stored_keypoints(file, ["000.png"])) == 1
+        return
+    with pytest.raises(bn.InputError, match=re.escape(DATABASES[change])) as error:
+        bn.import_map(model.folder, None, {"keypoints": str(file)})
+    assert str(file) in str(error.value)
+
+
+def _change_features(group: Any, how: str, file: Path) -> None:
+    import h5py
+
+    if how == "cycle":  # which no name of an image leads into
+        group.file["a"] = group.file["/"]
+    elif how == "soft link":
+        del group["keypoints"]
+        group["keypoints"] = h5py.SoftLink("/000.png")
+    elif how == "never written":
+        del group["keypoints"]
+        group.create_dataset("keypoints", (400_000_000, 2), dtype="f4", chunks=(1000, 2))
+    elif how == "compressed":
+        del group["scales"]
+        group.create_dataset("scales", (10**8,), dtype="f4", fillvalue=1, compression="gzip")
+    elif how == "elsewhere":
+        del group["descriptors"]
+        group.create_dataset("descriptors", (128, 10), dtype="u1", external=[(str(file), 0, 1280)])
+    else:
+        other = {"rank": np.ones((9, 2)), "text": np.array([b"a"] * 9), "NaN": np.full(len(group["scales"]), np.nan)}
+        del group["scales"]
+        group["scales"] = other[how]
+
+
+@pytest.mark.parametrize(
+    ("how", "expected"),
+    [
+        ("cycle", ""),
+        ("soft link", "000.png/keypoints is a link"),
+        ("never written", "declares 3,200,000,000 bytes that are not stored"),
+        ("compressed", "is compressed or in another file"),
+        ("elsewhere", "is compressed or in another file"),
+        ("rank", "[9, 2]"),
+        ("text", "an array of numbers"),
+        ("NaN", "keypoints of NaN"),
+    ],
+)
+def test_features_are_arrays_of_numbers_in_the_file_itself(model: Model, how: str, expected: str) -> None:
+    file = model.folder / "features.h5"
+    write_features(file, model.keypoints)
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(file, "r+") as opened:
+        _change_features(opened["000.png"], how, model.folder / "sparse/images.txt")
+    with contextlib.nullcontext() if how == "cycle" else refused(where=file, found=None) as caught:
+        stored_keypoints(file, ["000.png"])
+    assert how == "cycle" or expected in str(caught.error)
+    file.write_bytes(file.read_bytes()[:3000] + bytes(2000))
+    with refused(where=file, expected="features of hloc"):
+        stored_keypoints(file, ["000.png"])
 
 
 def test_each_photo_that_is_left_out_has_a_reason(model: Model, caplog: pytest.LogCaptureFixture) -> None:

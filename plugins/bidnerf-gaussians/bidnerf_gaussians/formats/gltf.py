@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry import SE3
-from bidnerf_core.io import parse_json, read_file
-from bidnerf_gaussians.formats.parts import LARGEST_FILE, gaussians_of, joined, logit
+from bidnerf_core.io import Allowance, parse_json, read_file
+from bidnerf_gaussians.formats.parts import LARGEST_FILE, gaussians_of, joined, logit, take_gaussians
 from bidnerf_gaussians.gaussians import COEFFICIENTS, Gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -26,8 +26,6 @@ JSON, BINARY = 0x4E4F534A, 0x004E4942
 """The kinds of chunks of a .glb file."""
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-MOST_COPIES = 16
-"""Nodes that show each mesh, on average: a file of any size could place a mesh any number of times."""
 
 
 def recognises(path: Path) -> bool:
@@ -90,25 +88,18 @@ def read(path: Path) -> Gaussians:
     """
     scene = _opened(path)
     try:
-        shown = _shown_meshes(scene)
+        shown, allowance = _shown_meshes(scene), Allowance.of(path, EXPECTED)
         meshes = {
             number: [
-                _gaussians(scene, primitive)
+                _gaussians(scene, primitive, allowance)
                 for primitive in scene.gltf["meshes"][number]["primitives"]
                 if EXTENSION in primitive.get("extensions", {})
             ]
             for number in dict.fromkeys(number for number, _ in shown)
         }
-        stored, placed = (
-            sum(len(part) for number in numbers for part in meshes[number])
-            for numbers in (meshes, [number for number, _ in shown])
-        )
-        if placed > MOST_COPIES * stored:
-            raise InputError(
-                f"its nodes show {placed:,} Gaussians, {stored:,} of them different",
-                where=path,
-                expected=f"at most {MOST_COPIES} times as many",
-            )
+        # Nodes could show a mesh any number of times, and meshes the same numbers.
+        for part in (part for number, _ in shown for part in meshes[number]):
+            take_gaussians(allowance, len(part), part.harmonics.shape[1])
         found = [_placed(part, matrix, path) for number, matrix in shown for part in meshes[number]]
     except (KeyError, TypeError, IndexError, ValueError, AttributeError, RuntimeError) as error:
         if isinstance(error, InputError) and error.where:
@@ -160,12 +151,13 @@ def _shown_meshes(scene: _Scene) -> list[tuple[int, np.ndarray]]:
 def _local(node: dict[str, Any]) -> np.ndarray:
     if "matrix" in node:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T  # column by column
-    turn, place = node.get("rotation", (0, 0, 0, 1)), node.get("translation", (0, 0, 0))
-    pose = SE3.from_quaternion(*(torch.tensor(part, dtype=torch.float64) for part in (turn, place)), "xyzw")
-    return np.asarray(pose.matrix()) * [*node.get("scale", (1, 1, 1)), 1.0]
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_quat(node.get("rotation", (0, 0, 0, 1))).as_matrix() * node.get("scale", (1, 1, 1))
+    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    return matrix
 
 
-def _gaussians(scene: _Scene, primitive: dict[str, Any]) -> Gaussians:
+def _gaussians(scene: _Scene, primitive: dict[str, Any], allowance: Allowance) -> Gaussians:
     names = primitive["attributes"]
     if "extensions" in primitive["extensions"][EXTENSION]:
         further = ", ".join(primitive["extensions"][EXTENSION]["extensions"])
@@ -187,6 +179,7 @@ def _gaussians(scene: _Scene, primitive: dict[str, Any]) -> Gaussians:
     )
     shapes = [part.shape for part in (position, scale, rotation, opacity, *harmonics)]
     count = len(position)
+    take_gaussians(allowance, count, len(harmonics))
     if shapes != [(count, 3), (count, 3), (count, 4), (count, 1), *[(count, 3)] * len(harmonics)]:
         raise InputError(f"its attributes have the shapes {shapes}", where=scene.path, expected="one for each Gaussian")
     return gaussians_of(

@@ -9,10 +9,19 @@ import numpy as np
 import torch
 from torch.nn.functional import pad
 
+from bidnerf_core.io import Allowance
 from bidnerf_gaussians.gaussians import Gaussians
 
 LARGEST_FILE = 16 * 2**30
 """Bytes."""
+
+
+def take_gaussians(allowance: Allowance, count: int, harmonics: int) -> None:
+    """Count the memory of ``count`` Gaussians with so many harmonics, in numbers of 32 bits and copies of them while they are read.
+
+    Raises ``InputError`` if a file of this size may not hold as many.
+    """
+    allowance.take(12 * count * (11 + 3 * harmonics))
 
 
 def gaussians_of(

@@ -12,14 +12,12 @@ import numpy as np
 from PIL import Image
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io import Archive, parse_json, read_file
-from bidnerf_gaussians.formats.parts import gaussians_of, logit, smallest_three
+from bidnerf_core.io import Allowance, Archive, parse_json, read_file
+from bidnerf_gaussians.formats.parts import gaussians_of, logit, smallest_three, take_gaussians
 from bidnerf_gaussians.gaussians import COEFFICIENTS, Gaussians
 
 META = "meta.json"
 EXPECTED = "a SOG folder or archive"
-LARGEST_MEMBER = 512 * 2**20
-"""Largest size of an unpacked archive member in bytes."""
 LARGEST_IMAGE = 64 * 2**20
 """Pixels: one for each Gaussian."""
 PALETTE_WIDTH = 64
@@ -59,10 +57,10 @@ def _members(path: Path) -> Member:
         def of_folder(name: str) -> bytes:
             if Path(name).name != name:
                 raise InputError(f"names a file {name!r}", where=path, expected=f"one next to {META}")
-            return read_file(folder / name, f"a part of {EXPECTED}", LARGEST_MEMBER)
+            return read_file(folder / name, f"a part of {EXPECTED}")
 
         return of_folder
-    return Archive(path, EXPECTED, LARGEST_MEMBER).read
+    return Archive(path, EXPECTED).read
 
 
 def _decoded(meta: Any, member: Member, path: Path) -> Gaussians:
@@ -71,10 +69,12 @@ def _decoded(meta: Any, member: Member, path: Path) -> Gaussians:
     count = meta["count"]
     if type(count) is not int or not 0 < count <= LARGEST_IMAGE:
         raise InputError(f"declares {count!r} Gaussians", where=path, expected=f"1 to {LARGEST_IMAGE:,}")
+    allowance = Allowance.of(path.parent if path.name == META else path, EXPECTED)
+    take_gaussians(allowance, count, COEFFICIENTS[meta["shN"]["bands"]] if "shN" in meta else 1)
 
     def pixels(part: str, number: int = 0) -> np.ndarray:
         name = meta[part]["files"][number]
-        found = _image(member(name), f"{path}: {name}").reshape(-1, 4)
+        found = _image(member(name), f"{path}: {name}", allowance).reshape(-1, 4)
         if len(found) < count:
             raise InputError(f"{name} has {len(found):,} pixels, too few for {count:,} Gaussians", where=path)
         return found[:count]
@@ -92,7 +92,9 @@ def _decoded(meta: Any, member: Member, path: Path) -> Gaussians:
     colour = pixels("sh0")
     harmonics = book("sh0")[colour[:, :3]][:, None]
     if "shN" in meta:
-        harmonics = np.concatenate([harmonics, _rest(meta["shN"], book("shN"), pixels, member, path)], axis=1)
+        harmonics = np.concatenate(
+            [harmonics, _rest(meta["shN"], book("shN"), pixels, member, path, allowance)], axis=1
+        )
     return gaussians_of(
         np.sign(logarithm) * np.expm1(np.abs(logarithm)),
         book("scales")[pixels("scales")[:, :3]],
@@ -103,13 +105,18 @@ def _decoded(meta: Any, member: Member, path: Path) -> Gaussians:
 
 
 def _rest(
-    meta: Any, book: np.ndarray, pixels: Callable[[str, int], np.ndarray], member: Member, path: Path
+    meta: Any,
+    book: np.ndarray,
+    pixels: Callable[[str, int], np.ndarray],
+    member: Member,
+    path: Path,
+    allowance: Allowance,
 ) -> np.ndarray:
     """Return the harmonics (n k 3) above degree 0: each Gaussian refers to a palette entry."""
     count = COEFFICIENTS[meta["bands"]] - 1
     labels = pixels("shN", 1).astype(np.int32)
     entry = labels[:, 0] + 256 * labels[:, 1]
-    palette = _image(member(meta["files"][0]), f"{path}: {meta['files'][0]}")
+    palette = _image(member(meta["files"][0]), f"{path}: {meta['files'][0]}", allowance)
     if palette.shape[1] != PALETTE_WIDTH * count:
         raise InputError(f"a palette {palette.shape[1]} wide", where=path, expected=PALETTE_WIDTH * count)
     entries = palette[..., :3].reshape(-1, count, 3)  # row by row, with ``PALETTE_WIDTH`` entries per row
@@ -118,7 +125,7 @@ def _rest(
     return book[entries[entry]]
 
 
-def _image(content: bytes, where: str) -> np.ndarray:
+def _image(content: bytes, where: str, allowance: Allowance) -> np.ndarray:
     """Decode the pixels (h w 4) of an image, whose size is checked before decoding."""
     try:
         with warnings.catch_warnings():
@@ -130,6 +137,7 @@ def _image(content: bytes, where: str) -> np.ndarray:
                     where=where,
                     expected=f"at most {LARGEST_IMAGE:,}",
                 )
+            allowance.take(8 * image.width * image.height)
             return np.asarray(image.convert("RGBA"))
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"is not a readable image ({error})", where=where, expected="a lossless WebP") from error

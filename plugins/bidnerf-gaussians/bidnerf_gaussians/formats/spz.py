@@ -17,8 +17,8 @@ import numpy as np
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io import read_file, write_file
-from bidnerf_gaussians.formats.parts import LARGEST_FILE, gaussians_of, logit, smallest_three
+from bidnerf_core.io import Allowance, read_file, write_file
+from bidnerf_gaussians.formats.parts import LARGEST_FILE, gaussians_of, logit, smallest_three, take_gaussians
 from bidnerf_gaussians.gaussians import COEFFICIENTS, Gaussians
 
 MAGIC = b"NGSP"
@@ -30,8 +30,6 @@ COLOUR_SCALE = 0.15
 FLIP = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
 """Rotation from the axes of the file (x right, y up, z back) to x right, y down, z forward."""
 ORIGIN = torch.zeros(3)
-MOST_INFLATED = 1032
-"""Largest factor by which deflate can compress. Zstandard can do more, but not on the data that distinguish Gaussians."""
 
 
 def recognises(path: Path) -> bool:
@@ -73,6 +71,7 @@ def _checked(header: tuple[Any, ...], versions: range, path: Path) -> tuple[int,
         raise InputError(f"harmonics of degree {degree}", where=path, expected="0 to 3")
     if bits > 24:
         raise InputError(f"{bits} fraction bits", where=path, expected="0 to 24")
+    take_gaussians(Allowance.of(path, EXPECTED), count, COEFFICIENTS[degree])
     return version, count, degree, bits
 
 
@@ -84,8 +83,6 @@ def _unzipped(content: bytes, path: Path) -> tuple[list[bytes], int, int, int, i
             raise InputError("is too short for a header", where=path, expected=EXPECTED)
         version, count, degree, bits = _checked(HEADER.unpack(start), range(1, 4), path)
         sizes = _sizes(version, count, degree)
-        if sum(sizes) > MOST_INFLATED * len(content):
-            raise InputError(f"declares {count:,} Gaussians, more than its {len(content):,} bytes can hold", where=path)
         # No more than declared is ever unpacked.
         rest = stream.decompress(stream.unconsumed_tail, sum(sizes) or 1)
     except zlib.error as error:
@@ -114,8 +111,6 @@ def _streams(content: bytes, path: Path) -> tuple[list[bytes], int, int, int, in
             where=path,
             expected=f"{len(wanted)} for {count:,} Gaussians of degree {degree}",
         )
-    if sum(sizes) > MOST_INFLATED * len(content):
-        raise InputError(f"declares {count:,} Gaussians, more than its {len(content):,} bytes can hold", where=path)
     found = []
     for index, size in enumerate(wanted):
         packed, unpacked = struct.unpack_from("<QQ", content, place + 16 * index)
