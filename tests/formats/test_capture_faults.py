@@ -104,6 +104,7 @@ def fisheye(file: Path) -> None:
 
 
 JSON = "transforms.json"
+DIGITS = "9" * 5000  # more than Python converts to an integer
 DEPTH_OF_TUM = "depth/1000.004000.png"
 FAULTS: dict[str, list[tuple[str, Edit, str | tuple[str, ...]]]] = {
     "record3d, unpacked": [
@@ -157,12 +158,26 @@ FAULTS: dict[str, list[tuple[str, Edit, str | tuple[str, ...]]]] = {
             ("line 8", "comma-separated"),
         ),
     ],
-    "kitti": [("../../poses/07.txt", Path.unlink, "poses.txt")],
+    "kitti": [
+        ("../../poses/07.txt", Path.unlink, "poses.txt"),
+        *(
+            ("calib.txt", content(f"P2: {row}\n"), "projects no image")
+            for row in ("0 " * 12, "2 0 6 0 0 2 6 0 2 0 6 0")
+        ),
+    ],
+    "twelve-scenes": [
+        ("info.txt", replaced("m_colorWidth = 16", "m_colorWidth = nan"), "its size is nan"),
+        ("info.txt", replaced("m_depthHeight = 12", "m_depthHeight = inf"), "its size is"),
+        ("split.txt", content(f"sequence0 [start=0 ; end={DIGITS}]"), "not finite"),
+    ],
     "euroc": [
         ("mav0/cam0/sensor.yaml", fisheye, ("equidistant", "radial-tangential")),
         ("mav0/cam0/sensor.yaml", replaced("resolution", "size"), ("resolution: has 0 numbers", "expected 2")),
         ("mav0/cam0/sensor.yaml", content("sensor_type: [camera"), "not YAML"),
         ("mav0/cam0/sensor.yaml", content("camera"), "has no entries"),
+        ("mav0/cam0/sensor.yaml", replaced("[16, 12]", "[nan, 12]"), ("resolution", "not finite")),
+        ("mav0/cam0/sensor.yaml", replaced("[16, 12]", f"[{DIGITS}, 12]"), ("resolution", "not finite")),
+        ("mav0/cam0/sensor.yaml", replaced("[16, 12]", "[1e300, 12]"), ("its size is 1e+300 x 12", "whole numbers")),
     ],
     "colmap": [
         ("sparse/0/cameras.txt", replaced("OPENCV", "THIN_PRISM_FISHEYE"), ("line 2", "THIN_PRISM_FISHEYE")),

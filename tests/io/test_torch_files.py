@@ -93,6 +93,13 @@ def test_a_number_that_stands_for_many(saved: Saved) -> None:
         assert read_saved(path, "a checkpoint", mapped=True)["a"][0].shape == large.shape
 
 
+def test_a_list_that_contains_itself_is_refused(saved: Saved) -> None:
+    endless: list[object] = [torch.zeros(2)]
+    endless.append(endless)
+    with refused(where=saved(endless), found="contains itself", expected="a checkpoint"):
+        read_saved(saved(endless), "a checkpoint", mapped=True)
+
+
 def test_an_archive_that_unpacks_to_more_than_its_size_is_not_unpacked(saved: Saved) -> None:
     path = saved({"a": torch.zeros(2**20)})
     with zipfile.ZipFile(path) as archive:
