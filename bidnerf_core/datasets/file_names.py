@@ -44,10 +44,10 @@ class FileNames:
         for folder in self._folders:
             parent = folder / name.parent if len(name.parts) > 1 else folder
             exact, like = (parent, name.name), ((self._on_disk(folder, t[:-1]), t[-1]) for t in tails)
-            for number, (parent, last) in enumerate((exact, *like)):
+            for number, (parent, stem) in enumerate((exact, *like)):
                 # Most names of a large file may be missing, so folders are listed instead of trying each ending.
                 exact_names, unique = self._names(parent)
-                for wanted in (f"{last}{ending}" for ending in endings):
+                for wanted in (f"{stem}{ending}" for ending in endings):
                     found = unique.get(wanted.lower(), wanted) if number else wanted
                     if found in exact_names and is_file(file := parent / found):
                         return file
