@@ -1,7 +1,9 @@
 from bidnerf.evaluation import Plan as Plan
 from bidnerf.evaluation import compare as compare
 from bidnerf.evaluation import evaluate as evaluate
+from bidnerf.results import Answers as Answers
 from bidnerf.results import export_map as export_map
+from bidnerf.results import localize as localize
 from bidnerf.results import read_poses as read_poses
 from bidnerf.results import track as track
 from bidnerf.results import write_poses as write_poses

@@ -138,7 +138,7 @@ def run_localize(
     relative poses come from the dataset, and the pose found is that of the last one's camera. Poses are camera to world with
     OpenCV axes (x right, y down, z forward).
     """
-    from bidnerf.results import Answers, localize_each
+    from bidnerf.results import Answers, localize
     from bidnerf_core.localization import (
         Localizer,
         landmark_cameras,
@@ -180,7 +180,7 @@ def run_localize(
             check_output(output.picture(name), inputs, output.overwrite)
     shown = Run(output, answers, len(source.names), start_of)
     with display_progress(), shown.save_at_end():
-        localize_each(finder, source, start=start_of, seed=seed, answers=answers, each=shown.show)
+        localize(finder, source, start=start_of, seed=seed, answers=answers, each=shown.show)
 
 
 def _holds_maps(path: Path) -> bool:
@@ -265,7 +265,7 @@ class Run:
                     say(answers.world_mismatch)
                 is_written = out is not None and bool(answers.given if takes_all else answers.accepted)
                 if out is not None and is_written:
-                    answers.save(out)
+                    answers.write(out)
                     if not is_whole:
                         say(f"{out}: written after {len(answers)} of {total} images")
         if out is not None and not is_written:

@@ -105,7 +105,7 @@ def run_track(
     with wrong_usage():
         settings = settings_of(USUAL_METHOD, {"depth_sensor": frames.depth_sensor, "risk": tracking.risk})
     scene = load_map(map, device)
-    path, began = Answers(scene, is_sequence=True), time.perf_counter()
+    path, began = Answers(scene, is_sequence=True, interval=tracking.config.frame_seconds), time.perf_counter()
     localizer = Localizer(scene, config=settings)
     try:
         with display_progress():
@@ -118,7 +118,7 @@ def run_track(
         with defer_interruptions():
             if path.given:
                 try:
-                    path.save(out)
+                    path.write(out)
                 finally:
                     if plot is not None:
                         path.plot(plot, scene.surface, scene.up)

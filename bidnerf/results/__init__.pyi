@@ -2,7 +2,6 @@ from .answers import BAD_INPUT as BAD_INPUT
 from .answers import Answer as Answer
 from .answers import Answers as Answers
 from .answers import Failure as Failure
-from .answers import localize_each as localize_each
 from .answers import plain_localization as plain_localization
 from .colmap_poses import check_pose_file as check_pose_file
 from .errors import CRITERIA as CRITERIA
@@ -21,6 +20,9 @@ from .errors import within as within
 from .export import export_map as export_map
 from .export import head as head
 from .export import ply as ply
+from .localizing import localize as localize
+from .matches import is_pose_of as is_pose_of
+from .matches import landmark_matches as landmark_matches
 from .overlays import Painter as Painter
 from .overlays import as_picture as as_picture
 from .overlays import overlay as overlay
@@ -36,12 +38,15 @@ from .plots import require_matplotlib as require_matplotlib
 from .plots import save_figure as save_figure
 from .plots import write_figure as write_figure
 from .pose_files import OPENCV_AXES as OPENCV_AXES
+from .pose_files import LandmarkMatches as LandmarkMatches
 from .pose_files import PosedImage as PosedImage
+from .pose_files import Refusal as Refusal
 from .pose_files import pose_entries as pose_entries
 from .pose_files import pose_format as pose_format
 from .pose_files import pose_of as pose_of
 from .pose_files import read_pose as read_pose
 from .pose_files import read_poses as read_poses
 from .pose_files import read_positions as read_positions
+from .pose_files import refused_file as refused_file
 from .pose_files import write_poses as write_poses
 from .tracking import track as track

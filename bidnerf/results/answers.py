@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float, Int
+from torch import Tensor
 
 from bidnerf.results.errors import (
     PoseError,
@@ -22,25 +24,21 @@ from bidnerf.results.errors import (
     within,
 )
 from bidnerf.results.plots import draw_path
-from bidnerf.results.pose_files import PosedImage, pose_format, write_poses
+from bidnerf.results.pose_files import LandmarkMatches, PosedImage, Refusal, pose_format, refused_file, write_poses
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import UpDirection, given_cameras
-from bidnerf_core.datasets import Query, QuerySource
-from bidnerf_core.depth import UNKNOWN_SENSOR, describe_depth_noise
-from bidnerf_core.errors import InputError, UsageError, amount
+from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3, LengthUnit, fit_similarity, symbol
 from bidnerf_core.io import write_file
 from bidnerf_core.localization import (
     Localization,
-    Localizer,
     SceneMap,
     origin_of,
     unit_of,
 )
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.maps import MapCollection, Placement
-from bidnerf_core.progress import Cancel, ProgressCallback, counter, job_context
 
 log = logging.getLogger("bidnerf")
 
@@ -60,6 +58,8 @@ class Answer:
     time: float | None = None  # seconds
     file: Path | None = None
     placement: Placement | None = None  # in one of several maps
+    # Keypoints (pixels of the upright image) that agree with landmarks of the map, and the indices of these landmarks.
+    matches: tuple[Float[Tensor, "m 2"], Int[Tensor, "m"]] | None = None
 
     @staticmethod
     def of(frame: Frame, number: int, localization: Localization, **about: Any) -> Answer:
@@ -88,21 +88,6 @@ class Answer:
         localization = self.localization
         return None if self.truth is None else pose_error(localization.T_world_camera, self.truth, localization.unit)
 
-    @property
-    def posed_image(self) -> PosedImage:
-        """The image with its pose, for pose files."""
-        localization = self.localization
-        return PosedImage(
-            self.name,
-            self.number,
-            self.intrinsics,
-            localization.T_world_camera,
-            self.file,
-            self.time,
-            localization.covariance,
-            localization.unit,
-        )
-
 
 @dataclass(frozen=True)
 class Failure:
@@ -119,9 +104,14 @@ class Answers:
     With several maps, each pose is in the frame of the map in which the image was localized.
     """
 
-    def __init__(self, scene: SceneMap | MapCollection | None = None, is_sequence: bool = False) -> None:
-        """Create an empty collection for a map or maps. With ``is_sequence``, JSON answers include the time of each frame."""
-        self.scene, self.is_sequence = scene, is_sequence
+    def __init__(
+        self, scene: SceneMap | MapCollection | None = None, is_sequence: bool = False, interval: float = 1.0
+    ) -> None:
+        """Create an empty collection for a map or maps. With ``is_sequence``, JSON answers include the time of each frame.
+
+        Trajectories of images without times are written as if they were ``interval`` seconds apart.
+        """
+        self.scene, self.is_sequence, self.interval = scene, is_sequence, interval
         self.given: list[Answer | Failure] = []
         self.unread = 0  # frames of a sequence whose files could not be read
         self._next = 0  # number of the next answer
@@ -137,6 +127,21 @@ class Answers:
     def __len__(self) -> int:
         return len(self.given)
 
+    def __iter__(self) -> Iterator[Answer | Failure]:
+        return iter(self.given)
+
+    def __getitem__(self, index: int) -> Answer | Failure:
+        return self.given[index]
+
+    def __repr__(self) -> str:
+        """Return a one-line description."""
+        return f"<Answers for {amount(len(self), 'image')}, {len(self.accepted)} accepted>"
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the images, in order."""
+        return [answer.name for answer in self.given]
+
     def append(self, answer: Answer | Failure) -> None:
         """Append an answer or a failure."""
         self.given.append(answer)
@@ -149,17 +154,18 @@ class Answers:
         time: float | None = None,
         truth: SE3 | None = None,
         number: int | None = None,
+        file: Path | None = None,
     ) -> Answer:
         """Add the answer for the next frame of a sequence, and return it.
 
         ``number`` is the frame's index in its sequence, by default one more than the last. ``time`` is in
-        seconds, ``truth`` is the true T_world_camera.
+        seconds, ``truth`` is the true T_world_camera, and ``file`` the image file.
         """
         number = self._next if number is None else number
         if frame.camera_source and frame.camera_source not in self._camera_sources:
             self._camera_sources.add(frame.camera_source)
             log.info("%s: %s", frame.name, frame.camera_source)
-        answer = Answer.of(frame, number, localization, truth=truth, time=time)
+        answer = Answer.of(frame, number, localization, truth=truth, time=time, file=file)
         self.append(answer)
         if not localization.converged and self._lost_at is None:
             self._lost_at = len(self)
@@ -241,23 +247,49 @@ class Answers:
             " dataset's world is not that of the map"
         )
 
-    def save(self, path: str | Path) -> None:
+    def write(self, path: str | Path) -> None:
         """Write the poses atomically, in the format selected by the file extension.
 
-        A ``.json`` file lists all answers with all details; files in other formats contain only the accepted
-        poses. Raises ``UsageError`` for an unknown extension, and ``InputError`` for images that the format
-        cannot describe.
+        A ``.json`` file lists all answers with all details. Files in other formats contain only the accepted poses; the other images are
+        named with their outcomes in comments, where the format has them, and in a file beside it, see ``refused_file``. Raises
+        ``UsageError`` for an unknown extension, and ``InputError`` for images that the format cannot describe.
         """
         path = Path(path)
         if pose_format(path) == ".json":
             rows = ",\n".join(json.dumps(self.plain(answer), allow_nan=False) for answer in self.given)
             write_file(path, f"[\n{rows}\n]\n".encode())
             return
-        accepted = self.accepted
-        write_poses(path, [answer.posed_image for answer in accepted])
-        if left_out := len(self) - len(accepted):
-            poses = amount(len(accepted), "pose")
-            log.info("%s: %s; %d without an accepted pose are left out", path, poses, left_out)
+        others = [
+            Refusal(each.name, BAD_INPUT, each.reason)
+            if isinstance(each, Failure)
+            else Refusal(each.name, str(each.localization.outcome), each.localization.reason)
+            for each in self.given
+            if not (isinstance(each, Answer) and each.accepted)
+        ]
+        write_poses(path, [self._posed(answer) for answer in self.accepted], others)
+        if others:
+            poses, images = amount(len(self.accepted), "pose"), amount(len(others), "image")
+            log.info("%s: %s; %s without an accepted pose: see %s", path, poses, images, refused_file(path).name)
+
+    def _posed(self, answer: Answer) -> PosedImage:
+        """Return the image of an answer with its pose, for pose files."""
+        found, landmarks, matches = answer.localization, getattr(self.scene, "landmarks", None), None
+        if answer.matches is not None and landmarks is not None:
+            pixels, landmark = answer.matches
+            positions = landmarks.positions[landmark.to(landmarks.positions.device)].cpu().double()
+            matches = LandmarkMatches(pixels, landmark, positions + origin_of(self.scene))
+        return PosedImage(
+            answer.name,
+            answer.number,
+            answer.intrinsics,
+            found.T_world_camera,
+            answer.file,
+            answer.time,
+            found.covariance,
+            found.unit,
+            matches=matches,
+            interval=self.interval,
+        )
 
     def to_pandas(self) -> Any:
         """Return the answers as a table (a pandas ``DataFrame``): a row for each image, in order.
@@ -375,74 +407,3 @@ class Answers:
 def plain_localization(localization: Localization, backend: str, error: PoseError | None) -> dict[str, Any]:
     """Return the JSON values of a localization, the backend of its map, and its error if known."""
     return localization.plain() | {"backend": backend, "error": None if error is None else error.plain()}
-
-
-def localize_each(
-    localizer: Localizer | MapCollection,
-    queries: QuerySource,
-    *,
-    start: Callable[[Query], SE3 | None] | None = None,
-    seed: int = 0,
-    answers: Answers | None = None,
-    each: Callable[[Query, Answer | Failure], None] | None = None,
-    progress: ProgressCallback | None = None,
-    cancel: Cancel | None = None,
-) -> Answers:
-    """Localize each query in a map or, among several maps, in the one that the query shows.
-
-    A query that cannot be read or localized does not stop the others, but if it is the only query, its error is
-    raised. ``start`` returns the initial T_world_camera of a query; method ``auto`` needs none, and with
-    several maps ``start`` is not used. ``answers`` is the object that collects the answers, by default a new
-    one; if an error ends the run, it holds the answers so far. ``each`` is called with each query and its
-    answer; for a failure, the query has only a name. Raises ``InputError``, and ``Cancelled`` once ``cancel``
-    returns True.
-    """
-    if answers is None:
-        answers = Answers(localizer if isinstance(localizer, MapCollection) else localizer.scene)
-    with job_context(progress, cancel):
-        count, total = counter("localizing", "images"), len(queries.names)
-        for number, name in enumerate(queries.names):
-            answer: Answer | Failure
-            query, placement = Query(name, ()), None
-            try:
-                query = queries.read(number)
-                truth = query.truth
-                if isinstance(localizer, MapCollection):
-                    if len(query.views) != 1:
-                        raise InputError("is a rig", where=name, expected="single images for several maps")
-                    placement = localizer(query.views[0].frame, seed)
-                    localization, truth = placement.found, None
-                else:
-                    if number == 0:
-                        _log_depth(query, getattr(localizer.config, "depth_sensor", UNKNOWN_SENSOR))
-                    begin = None if start is None else start(query)
-                    localization = localizer(query.views, begin, seed=seed)
-                frame = query.frame.replace(name=query.name)
-                answer = Answer.of(frame, number, localization, truth=truth, file=query.file, placement=placement)
-                if placement is None and not answer.is_finite:
-                    raise InputError(
-                        f"{localization.method} diverged to a pose that is not finite; is the map valid?", where=name
-                    )
-            except UsageError:
-                raise
-            except InputError as error:
-                if total == 1:
-                    raise
-                answer = Failure(name, localizer.method, str(error))
-            answers.append(answer)
-            if each is not None:
-                each(query, answer)
-            count(number + 1, total)
-    return answers
-
-
-def _log_depth(query: Query, sensor: str) -> None:
-    """Log if the images of a dataset have no measured depth, or if the depth noise does not match the sensor."""
-    bare = [view.frame.name for view in query.views if not view.frame.has_depth]
-    if bare and query.truth is not None:
-        log.info("%s: no measured depth; colour only", ", ".join(bare))
-    shown = query.frame
-    if sensor != "unknown" and shown.depth is not None and shown.has_depth:
-        remark = describe_depth_noise(shown.depth, shown.intrinsics, sensor)
-        if remark is not None:
-            log.info("%s: %s", query.name, remark)

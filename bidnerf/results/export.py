@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf.results.colmap_poses import write_colmap_model
-from bidnerf.results.pose_files import PosedImage, frame_of, write_pose_transforms
+from bidnerf.results.pose_files import LandmarkMatches, PosedImage, frame_of, write_pose_transforms
 from bidnerf_core.captures import write_inria_cameras
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.io import output_folder, write_file
@@ -109,40 +109,21 @@ def export_clouds(scene: Map, out: Path) -> list[Path]:
 
 def export_colmap(scene: Map, out: Path) -> list[Path]:
     """A COLMAP text model: the cameras, the landmarks as 3D points, and as their tracks the keypoints they were built from."""
-    images, landmarks = _images(scene, "colmap"), scene.landmarks
+    images, landmarks, points = _images(scene, "colmap"), scene.landmarks, None
     folder = os.path.commonpath([os.path.dirname(image.name) for image in images])
-    upright = [replace(image, name=os.path.relpath(image.name, folder or ".")) for image in images]
-    images = [image.as_stored for image in upright]
-    points, keypoints = list[str](), [list[str]() for _ in images]
     if landmarks is not None:
         positions = landmarks.positions.double() + origin_of(scene)
-        tracks = [list[str]() for _ in range(len(landmarks))]
-        total, count = torch.zeros(2, len(landmarks), dtype=torch.float64)
+        colours = (_colours(scene, landmarks).clamp(0, 1) * 255).round().long()
+        points = torch.arange(len(landmarks)), positions, colours
         if landmarks.tracks is None:
             log.info(f"{scene.name}: its landmarks have no tracks; 'bidnerf bake MAP --data DATA' finds them")
         else:
-            for number, (before, after) in enumerate(zip(upright, images, strict=True)):
+            for number, image in enumerate(images):
                 own = landmarks.tracks.image == number
                 seen, pixels = landmarks.tracks.landmark[own].long(), landmarks.tracks.pixel[own].double()
-                projected = before.intrinsics.project(before.pose.inverse().apply(positions[seen]))
-                total.index_add_(0, seen, (projected - pixels).norm(dim=-1))
-                count.index_add_(0, seen, torch.ones(len(seen), dtype=torch.float64))
-                if after is not before:
-                    rays = (after.pose.inverse() @ before.pose).rotate(before.intrinsics.unproject(pixels))
-                    pixels = after.intrinsics.project(rays)
-                for landmark, (u, v) in zip(seen.tolist(), pixels.tolist(), strict=True):
-                    tracks[landmark].append(f" {number + 1} {len(keypoints[number])}")
-                    keypoints[number].append(f"{u:.6g} {v:.6g} {landmark + 1}")
-        # The error of a point is the mean distance of its projections from its keypoints. With a single keypoint,
-        # the error is unknown, for which COLMAP has the value -1.
-        errors = torch.where(count > 1, total / count.clamp(min=1), -1).tolist()
-        colours = (_colours(scene, landmarks).clamp(0, 1) * 255).round().long().tolist()
-        digits = 16 if any(scene.origin) else 9
-        points = [
-            f"{number + 1} {x:.{digits}g} {y:.{digits}g} {z:.{digits}g} {r} {g} {b} {errors[number]:.3f}{''.join(tracks[number])}"
-            for number, ((x, y, z), (r, g, b)) in enumerate(zip(positions.tolist(), colours, strict=True))
-        ]
-    write_colmap_model(out / "images.txt", images, points, keypoints)
+                images[number] = replace(image, matches=LandmarkMatches(pixels, seen, positions[seen]))
+    images = [replace(image.as_stored, name=os.path.relpath(image.name, folder or ".")) for image in images]
+    write_colmap_model(out / "images.txt", images, points)
     return [out / "cameras.txt", out / "images.txt", out / "points3D.txt"]
 
 

@@ -5,16 +5,17 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from bidnerf_core.camera import UPRIGHT, Intrinsics, Orientation, read_exif
@@ -30,11 +31,31 @@ EXPECTED_POSITIONS = '{"NAME": [x, y, z], ...} or [{"frame": "NAME", "T_world_ca
 
 
 @dataclass(frozen=True, eq=False)
+class LandmarkMatches:
+    """The keypoints of an image that agree with landmarks of its map."""
+
+    pixels: Float[Tensor, "m 2"]  # of the upright image
+    landmark: Int[Tensor, "m"]  # index in the map's landmarks
+    positions: Float[Tensor, "m 3"]  # of the landmarks, world
+
+
+class Refusal(NamedTuple):
+    """An image without an accepted pose, which files of poses name in comments."""
+
+    name: str
+    outcome: str
+    reason: str
+
+    def __str__(self) -> str:
+        return printable(f"{self.name}: {self.outcome} ({self.reason})")
+
+
+@dataclass(frozen=True, eq=False)
 class PosedImage:
     """An image with its camera and an estimated pose."""
 
     name: str
-    number: int  # index in the run or sequence, from 0; serves as the time stamp of images without times
+    number: int  # index in the run or sequence, from 0
     intrinsics: Intrinsics  # of the upright image
     T_world_camera: SE3  # OpenCV axes
     file: Path | None = None
@@ -43,6 +64,8 @@ class PosedImage:
     covariance: Float[Tensor, "6 6"] | None = None
     unit: LengthUnit = "units"  # of the position
     orientation: Orientation | None = None  # how the stored image was turned upright; None: according to EXIF
+    matches: LandmarkMatches | None = None
+    interval: float = 1.0  # seconds between images, assumed where there are no times
 
     @property
     def pose(self) -> SE3:
@@ -73,8 +96,12 @@ class PosedImage:
         inverse = Orientation(orientation.mirrors_columns, orientation.mirrors_rows)
         if orientation.transposes:
             inverse = Orientation(orientation.mirrors_rows, orientation.mirrors_columns, True)
-        pose = self.pose @ SE3(turn, torch.zeros(3, dtype=torch.float64))
-        return replace(self, intrinsics=self.intrinsics.upright(inverse), T_world_camera=pose)
+        T_upright_stored = SE3(turn, torch.zeros(3, dtype=torch.float64))
+        stored, matches = self.intrinsics.upright(inverse), self.matches
+        if matches is not None:
+            rays = T_upright_stored.inverse().rotate(self.intrinsics.unproject(matches.pixels))
+            matches = replace(matches, pixels=stored.project(rays))
+        return replace(self, intrinsics=stored, T_world_camera=self.pose @ T_upright_stored, matches=matches)
 
 
 def common_unit(images: Sequence[PosedImage]) -> LengthUnit:
@@ -95,7 +122,7 @@ def time_stamps(images: Sequence[PosedImage]) -> tuple[list[tuple[float, PosedIm
 
     Trajectory formats need stamps that increase. A time is that of the image or, as in the TUM RGB-D data sets, its
     name, if that is a number with a fraction. If an image has neither, or two have the same time, the stamps are the
-    numbers of the images.
+    numbers of the images times the ``interval`` that is assumed between them.
     """
     times = dict[float, PosedImage]()
     for image in images:
@@ -105,23 +132,27 @@ def time_stamps(images: Sequence[PosedImage]) -> tuple[list[tuple[float, PosedIm
         if time is not None:
             times[round(time, 6)] = image
     are_times = len(times) == len(images)
-    stamped = times.items() if are_times else [(float(image.number), image) for image in images]
+    stamped = times.items() if are_times else [(image.number * image.interval, image) for image in images]
     return sorted(stamped, key=lambda pair: pair[0]), are_times
 
 
-def write_tum(path: Path, images: Sequence[PosedImage]) -> None:
+def write_tum(path: Path, images: Sequence[PosedImage], refused: Sequence[Refusal] = ()) -> None:
     """A TUM trajectory: rows of time stamp, position, and unit quaternion with the scalar last.
 
     See ``time_stamps`` and https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats. If the stamps are not
     times, a comment before each row names the image, since other programs skip comments.
     """
     stamped, are_times = time_stamps(images)
-    rows = [f"# timestamp tx ty tz qx qy qz qw ({frame_of(images)})"]
+    rows = [
+        f"# timestamp tx ty tz qx qy qz qw ({frame_of(images)})",
+        *(f"# without a pose: {each}" for each in refused),
+    ]
     for stamp, image in stamped:
         if not are_times:
             rows.append(f"# {printable(image.name if image.file is None else image.file.name)}")
         numbers = (*image.pose.translation.tolist(), *image.pose.quaternion("xyzw").tolist())
-        rows.append(" ".join((f"{stamp:.{6 * are_times}f}", *(f"{number:.12g}" for number in numbers))))
+        digits = 0 if not are_times and image.interval == 1 else 6
+        rows.append(" ".join((f"{stamp:.{digits}f}", *(f"{number:.12g}" for number in numbers))))
     write_file(path, "\n".join([*rows, ""]).encode())
 
 
@@ -167,7 +198,10 @@ def _defects(writer: Any) -> Iterator[str]:
 
 
 PoseWriter: TypeAlias = Callable[[Path, Sequence[PosedImage]], None]
-"""A function that writes poses to a file atomically."""
+"""A function that writes poses to a file atomically.
+
+If it takes ``refused`` as well, it also gets the images without an accepted pose, for comments.
+"""
 
 POSE_WRITERS: Plugins[PoseWriter] = Plugins("writers", _defects)
 """Writers by file-name ending; if several match, the longest ending is used.
@@ -188,17 +222,29 @@ def pose_format(path: Path) -> str:
     return ending
 
 
-def write_poses(path: str | Path, images: Sequence[PosedImage]) -> None:
+def write_poses(path: str | Path, images: Sequence[PosedImage], refused: Sequence[Refusal] = ()) -> None:
     """Write poses in the format selected by the file-name ending.
 
-    Raises ``InputError`` for an unknown ending, and for images that are not ``PosedImage``.
+    Formats with comments list the ``refused`` images. A text file beside it, such as "path.refused.txt", names them in a line each;
+    one of an earlier run is replaced. Raises ``InputError`` for an unknown ending, and for images that are not ``PosedImage``.
     """
     path = Path(path)
     is_list = isinstance(images, Sequence)
     if odd := [image for image in images if not isinstance(image, PosedImage)] if is_list else [images]:
         expected = "a list of PosedImage(name, number, intrinsics, T_world_camera)"
         raise InputError(f"got a {type(odd[0]).__name__}", where=path, expected=expected)
-    POSE_WRITERS[pose_format(path)](path, images)
+    ending = pose_format(path)
+    write: Any = POSE_WRITERS[ending]
+    more = {"refused": refused} if "refused" in inspect.signature(write).parameters else {}
+    write(path, images, **more)
+    beside = refused_file(path)
+    if refused or beside.exists():
+        write_file(beside, "".join(f"{each}\n" for each in refused).encode())
+
+
+def refused_file(path: Path) -> Path:
+    """Return the file beside a pose file that names the images without an accepted pose."""
+    return path.with_name(f"{path.name[: -len(path.suffix)]}.refused.txt")
 
 
 def read_pose(path: str | Path) -> SE3:

@@ -14,6 +14,7 @@ from bidnerf_core.localization import (
     Localizer,
     SceneMap,
     Tracker,
+    TrackerConfig,
     landmark_cameras,
 )
 from bidnerf_core.progress import Cancel, ProgressCallback, counter, job_context
@@ -51,7 +52,7 @@ def track(
         stored = tracker.localizer.scene
         sequence = open_sequence(sequence, assumed=landmark_cameras(stored), background=stored.bounds.background)
     if answers is None:
-        answers = Answers(tracker.localizer.scene, is_sequence=True)
+        answers = Answers(tracker.localizer.scene, is_sequence=True, interval=TrackerConfig().frame_seconds)
     total = -(-len(sequence) // every)
     with job_context(progress, cancel):
         count = counter("tracking", "frames")
@@ -69,7 +70,9 @@ def track(
                 answers.unread += 1
             else:
                 frame = timed.frame if depth else timed.frame.replace(depth=None)
-                answer = answers.add(frame, tracker(frame, timed.time), timed.time, timed.truth, index)
+                answer = answers.add(
+                    frame, tracker(frame, timed.time), timed.time, timed.truth, index, sequence.shots[index].file
+                )
                 if each is not None:
                     each(timed.frame, answer)
             count(number + 1, total)

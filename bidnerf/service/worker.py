@@ -19,7 +19,8 @@ from io import BufferedRWPair
 from pathlib import Path
 from typing import Any
 
-from bidnerf.results import Answer, localize_each
+from bidnerf.results import Answer
+from bidnerf.results import localize as localize_photos
 from bidnerf.service.models import MapFacts, Refused, Upload
 from bidnerf.service.protocols import PROTOCOLS
 from bidnerf.service.upload import public_message, read_upload
@@ -89,9 +90,9 @@ class LoadedMaps:
         if several is not None and start is not None:
             raise InputError("start was given without map", expected=f"map as one of {', '.join(self.localizers)}")
         if several is not None:
-            answers: Any = localize_each(several, photos, seed=upload.seed)
+            answers: Any = localize_photos(several, photos, seed=upload.seed)
         else:
-            answers = localize_each(localizer, photos, start=lambda _: start, seed=upload.seed)
+            answers = localize_photos(localizer, photos, start=lambda _: start, seed=upload.seed)
         (answer,) = answers.answers
         return answer, {**answers.plain(answer), "frame": upload.name}
 

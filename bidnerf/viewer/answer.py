@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf.results import pose_error
+from bidnerf.results import landmark_matches, pose_error
 from bidnerf.viewer.evidence import HERE, acceptance_figures, contests, last_answer, name_earlier, probable_poses
 from bidnerf.viewer.pictures import Json, jpeg_json, pack, png_json, quick_image
 from bidnerf.viewer.scene import frustum, matrix_rows
@@ -258,15 +258,8 @@ def _matches(scene: SceneMap, localization: Localization, answer: LandmarkAnswer
     if scene.landmarks is None:
         return None
     mode, best = answer.mode, answer.posterior.best
-    query, matches, state = mode.query, mode.matches, answer.posterior.states[best : best + 1]
-    agree = answer.landmarks.residuals(state)[0][0, : len(matches)] <= 9
-    refused = mode.by_descriptors[~torch.isin(mode.by_descriptors.keypoint, matches.keypoint)]
-    keypoint = torch.cat([matches.keypoint, refused.keypoint])
-    landmark = torch.cat([matches.landmark, refused.landmark])
-    agree = torch.cat([agree, torch.zeros(len(refused), dtype=torch.bool)])
-    is_last = query.view[keypoint] == len(query.images) - 1
-    by_descriptors = int(is_last[len(matches) :].sum())
-    keypoint, landmark, agree = keypoint[is_last], landmark[is_last], agree[is_last]
+    query, state = mode.query, answer.posterior.states[best : best + 1]
+    keypoint, landmark, agree, by_descriptors = landmark_matches(answer)
     seen = project(state, scene.landmarks.positions[landmark].double()[None], query.sights[keypoint])
     there = query.camera.project(torch.cat([seen.image[0], torch.ones(len(keypoint), 1)], dim=-1))
     there = torch.where(seen.front[0, :, None], there, torch.nan)

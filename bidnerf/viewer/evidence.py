@@ -6,8 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-import torch
-
+from bidnerf.results import is_pose_of
 from bidnerf.viewer.pictures import Json
 from bidnerf.viewer.scene import matrix_rows
 from bidnerf_core.geometry import SE3, symbol
@@ -24,7 +23,6 @@ from bidnerf_core.localization import (
     SearchRecord,
     Support,
     odds,
-    same_pose,
 )
 
 HERE, EARLIER = "the pose found", "an earlier pose by landmarks, which was given up"
@@ -49,9 +47,7 @@ def contests(localization: Localization, record: SearchRecord | None) -> tuple[J
 
 def name_earlier(localization: Localization, answer: LandmarkAnswer) -> str:
     """Return ``EARLIER`` if the pose from landmarks differs from the pose found, else an empty string."""
-    T, other = localization.T_world_camera.to("cpu", torch.float64), answer.T_world_rig.to("cpu", torch.float64)
-    middle = torch.tensor([0.0, 0.0, answer.distance], dtype=torch.float64)
-    return "" if bool(same_pose(T, other[None], middle)) else EARLIER
+    return "" if is_pose_of(localization, answer) else EARLIER
 
 
 def probable_poses(answer: LandmarkAnswer) -> list[tuple[int, SE3, float]]:

@@ -69,7 +69,7 @@ def answers(path: Path, number: int) -> None:
     given = Answers()
     for n in range(number):
         given.append(Answer.of(bn.Frame(f"{n}", torch.zeros((6, 8, 3)), CAMERA), n, FOUND))
-    given.save(path)
+    given.write(path)
 
 
 def results(path: Path, number: int) -> None:

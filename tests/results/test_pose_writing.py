@@ -143,6 +143,27 @@ def test_any_poses_that_are_written_are_read_again(
         torch.testing.assert_close(one.matrix(), other.matrix(), atol=1e-9, rtol=0)
 
 
+def test_frames_of_a_sequence_without_times_get_the_assumed_ones(tmp_path: Path) -> None:
+    """A film of a second would otherwise last for minutes; comments name the frames."""
+    given = [replace(image, interval=0.05) for image in images(["0004", "0012", "0020"])]
+    write_poses(tmp_path / "path.tum", [replace(image, number=4 * image.number) for image in given])
+    assert np.loadtxt(tmp_path / "path.tum")[:, 0].tolist() == pytest.approx([0.0, 0.2, 0.4])
+    assert (tmp_path / "path.tum").read_text().splitlines()[1::2] == ["# 0004", "# 0012", "# 0020"]
+
+
+def test_cameras_share_an_entry_only_if_their_pixels_agree(tmp_path: Path) -> None:
+    """Localization estimates the camera of each photo anew, so that those of one phone differ by hundredths of a pixel."""
+    first, second, third = images(["a", "b", "c"])
+    close, far = (replace(CAMERA, fx=CAMERA.fx * factor) for factor in (1.0001, 1.2))
+    write_poses(tmp_path / "images.txt", [first, replace(second, intrinsics=close), replace(third, intrinsics=far)])
+    assert len((tmp_path / "cameras.txt").read_text().splitlines()) == 2 + 2
+
+
+def test_names_in_the_poses_of_hloc_have_no_space(tmp_path: Path) -> None:
+    with refused(where=tmp_path / "a.hloc.txt", found="the image 'a b' has a space", expected="images.txt or .json"):
+        write_poses(tmp_path / "a.hloc.txt", images(["a b", "c"]))
+
+
 def test_rows_of_kitti_do_not_state_their_image(tmp_path: Path) -> None:
     first, _, *others = images(["a", "b", "c"])
     with pytest.warns(InputWarning, match="image 1 has no pose; KITTI rows do not state their image"):
@@ -205,7 +226,7 @@ def test_the_head_of_euroc_poses_names_the_unit_of_the_map(unit: Any, written: s
 
 
 def test_an_unknown_ending_is_refused(tmp_path: Path) -> None:
-    endings = ".euroc.csv, .json, .kitti.txt, .tum, .txt, images.txt, transforms.json"
+    endings = ".euroc.csv, .hloc.txt, .json, .kitti.txt, .tum, .txt, images.txt, transforms.json"
     with refused(where=tmp_path / "poses.csv", expected=f"a name that ends with {endings}"):
         write_poses(tmp_path / "poses.csv", images(["a", "b"]))
 

@@ -70,7 +70,7 @@ def test_a_sequence_is_tracked_in_a_thread_of_any_kind(folder: Path, caplog: pyt
     assert errors.poses == FRAMES - 1
     assert errors.raw.translation_p95 < 0.02
     assert [line for line in caplog.messages if "tracking again after 1 frame" in line]
-    path.save(folder.parent / "path.json")
+    path.write(folder.parent / "path.json")
     assert [pose["converged"] for pose in json.loads((folder.parent / "path.json").read_text())] == [
         n != 2 for n in range(FRAMES)
     ]
@@ -227,9 +227,59 @@ def test_answers_in_a_format_of_poses_hold_the_accepted_ones(tmp_path: Path, cap
     for found in (FOUND, replace(FOUND, outcome=Outcome.CONVERGED)):
         answers.append(Answer.of(frame, len(answers), found))
     with caplog.at_level(logging.INFO, "bidnerf"):
-        answers.save(tmp_path / "poses.tum")
-    assert len((tmp_path / "poses.tum").read_text().splitlines()) == 3  # a heading, a name and a pose
-    assert "1 without an accepted pose are left out" in caplog.text
+        answers.write(tmp_path / "poses.tum")
+    refused_one = f"a: {FOUND.outcome} ({FOUND.reason})"
+    _, remark, name, _ = (tmp_path / "poses.tum").read_text().splitlines()
+    assert (remark, name) == (f"# without a pose: {refused_one}", "# a")
+    assert (tmp_path / "poses.refused.txt").read_text() == f"{refused_one}\n"
+    assert "poses.tum: 1 pose; 1 image without an accepted pose: see poses.refused.txt" in caplog.text
+    answers_with([FOUND.T_world_camera], [FOUND.T_world_camera]).write(tmp_path / "poses.tum")
+    assert (tmp_path / "poses.refused.txt").read_text() == ""  # that of the earlier run is replaced
+
+
+def test_answers_for_a_folder_have_names_and_become_a_colmap_model(folder: Path, tmp_path: Path) -> None:
+    """The points of the model are the map's landmarks, at the keypoints that agree with them; a refused image is named."""
+    pycolmap, known = pytest.importorskip("pycolmap"), scene()
+    answers = bn.localize(known, folder)
+    assert answers.names == [answer.name for answer in answers] == [frame.name for _, frame, _ in flight()[:FRAMES]]
+    assert [each.accepted for each in answers.answers] == [number != 2 for number in range(FRAMES)]
+    answers.write(tmp_path / "images.txt")
+    model = pycolmap.Reconstruction(str(tmp_path))
+    assert len(model.cameras) == 1
+    assert model.num_reg_images() == FRAMES - 1
+    distances = list[float]()
+    for image in model.images.values():
+        seen = [each for each in image.points2D if each.has_point3D()]
+        assert len(seen) > 20
+        for keypoint in seen:
+            point = model.points3D[keypoint.point3D_id]
+            np.testing.assert_allclose(point.xyz, known.landmarks.positions[keypoint.point3D_id - 1], atol=1e-6)
+            distances.append(float(np.linalg.norm(image.project_point(point.xyz) - keypoint.xy)))
+    assert np.median(distances) < 1.0
+    left_out = f"{answers.names[2]}: {answers.answers[2].localization.outcome}"
+    assert f"# without a pose: {left_out}" in (tmp_path / "images.txt").read_text()
+    assert (tmp_path / "images.refused.txt").read_text().startswith(left_out)
+    answers.write(tmp_path / "poses.hloc.txt")
+    for row, image in zip(
+        (tmp_path / "poses.hloc.txt").read_text().splitlines(), sorted(model.images.items()), strict=True
+    ):
+        name, *numbers = row.split()
+        assert name == image[1].name
+        rigid = image[1].cam_from_world()
+        x, y, z, w = rigid.rotation.quat
+        np.testing.assert_allclose(np.array(numbers, float), [w, x, y, z, *rigid.translation], atol=1e-9)
+
+
+def test_what_is_localized_may_be_given_in_any_form(folder: Path) -> None:
+    """Files of photos, frames in memory, views and rigs; anything else is refused."""
+    known, frames = scene(), [frame for _, frame, _ in flight()[:2]]
+    (first, second) = bn.localize(bn.Localizer(known, warm_up=False), [frames[0], bn.View(frames[1], SE3.identity())])
+    assert (first.name, second.name) == (frames[0].name, frames[1].name)
+    assert bn.localize(known, frames[0]).accepted[0].name == frames[0].name
+    photo = next((folder / "images").rglob("*.png"))
+    assert bn.localize(known, [photo, photo.parent / "none.png"]).names == [photo.stem, "none"]
+    with refused(where="queries", found="got a int", expected="photos by path, or a Frame, View or list of Views"):
+        bn.localize(known, [7])  # type: ignore[list-item]
 
 
 def test_answers_count_on_after_failures() -> None:
