@@ -29,8 +29,9 @@ SHOW_LONG = { grep --line-buffered -E 'Downloading .*(MB|GB)|^Installing collect
 help: ## this list
 	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/^([a-z]+):[^#]*## /  make \1\t/' | expand -t 18
 
-demo: $(VENV)/.installed-plots ## train a small scene, find poses in it, draw the result in demo-out/
+demo: $(VENV)/.installed-demo ## train a small scene, find poses in it, draw the result in demo-out/
 	@$(BIN)/bidnerf demo --out $(DEMO_OUT) --overwrite
+	@echo "the command is found after: . $(VENV)/bin/activate"
 
 test: $(VENV)/.installed-dev ## tests of all parts, in minutes; ARGS="-k se3" for some
 	@$(PYTEST) -m "not slow" $(ARGS)
@@ -79,9 +80,9 @@ $(BIN)/pip:
 	@$(INSTALL) --quiet --upgrade pip # that of Python 3.11 takes twice as long for all the rest
 
 # A stamp says that the environment matches the requirements; it is written last, so an interrupted install is repeated.
-$(VENV)/.installed-plots: $(REQUIREMENTS) | $(BIN)/pip
+$(VENV)/.installed-demo: $(REQUIREMENTS) | $(BIN)/pip
 	@echo "installing bidnerf and what it needs (minutes, the first time)"
-	@$(INSTALL) -e '.[plots]' | $(SHOW_LONG)
+	@$(INSTALL) -e '.[plots,viewer]' | $(SHOW_LONG)
 	@touch $@
 
 $(VENV)/.installed-docs: $(REQUIREMENTS) | $(BIN)/pip
@@ -92,4 +93,4 @@ $(VENV)/.installed-docs: $(REQUIREMENTS) | $(BIN)/pip
 $(VENV)/.installed-dev: $(REQUIREMENTS) | $(BIN)/pip
 	@echo "installing bidnerf, what it needs and what its tests need (minutes, the first time)"
 	@$(INSTALL) -e '.[dev]' -e plugins/bidnerf-scanner-app | $(SHOW_LONG)
-	@touch $@ $(VENV)/.installed-plots $(VENV)/.installed-docs
+	@touch $@ $(VENV)/.installed-demo $(VENV)/.installed-docs

@@ -108,7 +108,7 @@ def run_demo(
                     ]
                 )
         show("Pose errors before and after")
-        print_table(["frame", "method", "start", "", "found", "", "steps", "seconds", "converged"], rows)
+        print_table(["frame", "method", "start", "", "found", "", "steps", "seconds", "accepted"], rows)
         _draw(stored, trials, out)
 
 
@@ -137,4 +137,4 @@ def _draw(stored: Map, trials: list[DemoFrame], out: Path) -> None:
     with console.status("drawing the animation"):
         save_gif(out / "localization.gif", [painter.blend(path[i]) for i in moments])
     show(f"look at {out / 'overlay-*.png'}, {out / 'localization.gif'}")
-    show(f"see why a pose was found: bidnerf view {out / 'map'} {out / 'data'}")
+    show(f"see why a pose was found: bidnerf view {out / 'map'} {out / 'data'}  (pip install 'bidnerf[viewer]')")

@@ -23,7 +23,7 @@ from bidnerf.cli.options import (
     require_device,
     wrong_usage,
 )
-from bidnerf.cli.output import check_folder, console, print_json, require_outside_maps, say, show
+from bidnerf.cli.output import check_folder, console, print_result, require_outside_maps, say
 from bidnerf.cli.parser import Group, Option, Without
 from bidnerf.cli.running import display_progress, interruptible_work
 from bidnerf_core.datasets import DatasetOptions
@@ -162,10 +162,8 @@ def run_evaluate(
     require_outside_maps(out.parent, out)
     with interruptible_work("waiting for the trials under way (Ctrl-C again: at once)"):
         table = evaluate(map, data or map, plan, out=out, workers=work.dask or work.workers)
-    if json:
-        print_json([row.plain() for row in table.rows])
-        return
-    show(f"{amount(len(table.rows), 'trial')} in {out}; 'bidnerf report {out}' shows them")
+    text = f"{amount(len(table.rows), 'trial')} in {out}; 'bidnerf report {out}' shows them"
+    print_result([row.plain() for row in table.rows], [text], json)
 
 
 def run_compare(
@@ -220,11 +218,7 @@ def run_compare(
                 say(f"look at {comparison_figure(out, comparison).with_suffix('.png')}")
             except InputError as error:  # matplotlib is optional
                 say(str(error))
-    if json:
-        print_json(to_plain(replace(comparison, results=())))
-        return
-    for line in str(comparison).split("\n"):
-        show(line)
+    print_result(to_plain(replace(comparison, results=())), str(comparison).split("\n"), json)
 
 
 def run_report(
@@ -269,9 +263,7 @@ def run_report(
     runs = [(path.name, read_runs(path)) for path in results]
     with console.status("drawing"):
         page = write_report(table, out, title, chosen, runs, None if view is None else link_to(view, out), data)
-    for line in str(table).split("\n"):
-        show(line)
-    show(f"look at {page}")
+    print_result(None, [*str(table).split("\n"), f"look at {page}"], json=False)
 
 
 def link_to(page: Path, folder: Path) -> str:

@@ -242,7 +242,7 @@ class Run:
 
     @contextlib.contextmanager
     def save_at_end(self) -> Iterator[None]:
-        """Write the pose file at the end and, if there are several queries, print how many converged.
+        """Write the pose file at the end and, if there are several queries, print how many were accepted.
 
         If the run is stopped early, the answers so far are written. Raises ``InputError`` if the file's format takes
         only accepted poses and there are none, and if a query failed.
@@ -260,7 +260,7 @@ class Run:
                 if is_whole and total > 1:
                     scene = answers.scene
                     more = f" in {len(scene)} maps" if isinstance(scene, MapCollection) else ""
-                    say(f"{len(answers.accepted)} of {total} converged{more}")
+                    say(f"{len(answers.accepted)} of {total} accepted{more}")
                 if is_whole and answers.world_mismatch is not None:
                     say(answers.world_mismatch)
                 is_written = out is not None and bool(answers.given if takes_all else answers.accepted)
@@ -269,7 +269,7 @@ class Run:
                     if not is_whole:
                         say(f"{out}: written after {len(answers)} of {total} images")
         if out is not None and not is_written:
-            raise InputError("not written, since no pose converged; a .json file takes all of them", where=out)
+            raise InputError("not written, since no pose was accepted; a .json file takes all of them", where=out)
         if failed := len(answers) - len(answers.answers):
             raise InputError(f"{failed} of {total} queries could not be read or localized, see above")
 
@@ -280,7 +280,7 @@ def answer_lines(answer: Answer, full: bool) -> list[str]:
     from bidnerf_core.geometry import symbol
 
     localization, error, placement = answer.localization, answer.error, answer.placement
-    verdict = "converged" if localization.converged else f"NOT converged: {localization.outcome.value}"
+    verdict = "accepted" if localization.converged else f"refused: {localization.outcome.value}"
     verdict = f"{verdict} ({localization.reason})"
     world, runner_up = "", []
     if placement is not None:
@@ -288,7 +288,7 @@ def answer_lines(answer: Answer, full: bool) -> list[str]:
         verdict, world = f"{where} {placement.map}: {verdict}", f"in the frame of {placement.map}, "
     if placement is not None and placement.runner_up is not None:
         name, other = placement.runner_up
-        outcome = "converged too" if other.converged else other.outcome
+        outcome = "accepted too" if other.converged else other.outcome
         runner_up = [f"  runner-up {name}: {outcome} ({other.reason})"]
     if error is not None:
         offset = f"{float(error.translation):.4f} {symbol(error.unit)}, {float(error.rotation_deg):.3f} deg"

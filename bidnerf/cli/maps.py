@@ -26,7 +26,7 @@ from bidnerf.cli.options import (
     require_inputs,
     require_one,
 )
-from bidnerf.cli.output import check_folder, check_output, print_json, say, show
+from bidnerf.cli.output import check_folder, check_output, print_result, say
 from bidnerf.cli.parser import Flag, Group, Option, SettingsGroup
 from bidnerf.cli.running import display_progress, interruptible_work
 from bidnerf_core.errors import InputError, UsageError, amount
@@ -67,11 +67,8 @@ def run_info(
         points = None if scene.landmarks is None else scene.landmarks.positions
         draw_capture(scene.capture, points, seen_by, draw, scene.unit)
         say(f"{draw}: written")
-    if json:
-        print_json(scene.describe().plain())
-        return
-    for line in str(scene.describe()).splitlines():
-        show(line)
+    summary = scene.describe()
+    print_result(summary.plain(), str(summary).splitlines(), json)
 
 
 def run_export(
@@ -98,11 +95,8 @@ def run_export(
 
     check_folder(out, (map,))
     files = export_map(map, out, to, overwrite)
-    if json:
-        print_json([{"file": str(file), "bytes": file.stat().st_size} for file in files])
-        return
-    for file in files:
-        show(f"{file}: {file.stat().st_size / 1e6:.2f} MB")
+    sizes = {str(file): file.stat().st_size for file in files}
+    print_result(sizes, [f"{file}: {size / 1e6:.2f} MB" for file, size in sizes.items()], json)
 
 
 def run_scale(
@@ -157,11 +151,9 @@ def run_scale(
             factor = factor_of_distance(scene, first, second, metres)
         assert factor is not None
         stored = scene.scaled(factor).write_to(out or map)
-    if json:
-        print_json(stored.describe().plain())
-        return
     sides = " x ".join(f"{side:.3g}" for side in stored.bounds.size)
-    show(f"{out or map}: all lengths multiplied by {factor:.6g}; the scene is now in metres, in a box of {sides}")
+    text = f"{out or map}: all lengths multiplied by {factor:.6g}; the scene is now in metres, in a box of {sides}"
+    print_result(stored.describe().plain(), [text], json)
 
 
 def run_render(
@@ -215,19 +207,14 @@ def _render_views(scene: Map, level: int | None, views: Sequence[View], out: Pat
         image = scene.render(view, level)
         write_images(out, view.frame.name, image)
         scores.append(rendering_scores(image, view.frame, scene.unit))
-        if json:
-            print_json({"frame": view.frame.name, "psnr": scores[-1].psnr, "depth_error": scores[-1].depth_error})
-        else:
-            show(f"{view.frame.name}  {scores[-1]}")
+        row = {"frame": view.frame.name, "psnr": scores[-1].psnr, "depth_error": scores[-1].depth_error}
+        print_result(row, [f"{view.frame.name}  {scores[-1]}"], json)
         count(number + 1, len(views))
-    if json:
-        return
     errors = torch.cat([score.depth_errors for score in scores])
     mean = RenderingScores(statistics.fmean(score.psnr for score in scores), errors, scene.unit)
     error = "-" if mean.depth_error is None else f"{mean.depth_error:.4f}"
-    show(
-        f"mean of {len(scores)}: PSNR {mean.psnr:.2f} dB; median depth error over all pixels {error} {symbol(scene.unit)}"
-    )
+    text = f"PSNR {mean.psnr:.2f} dB; median depth error over all pixels {error} {symbol(scene.unit)}"
+    print_result({"psnr": mean.psnr, "depth_error": mean.depth_error}, [f"mean of {len(scores)}: {text}"], json)
 
 
 def write_images(out: Path, name: str, image: RenderedImage) -> None:
@@ -292,8 +279,7 @@ def run_bake(
         scene = scene.bake(
             data, config, images=images, rendered_landmarks=rendered_landmarks, features=landmark_features
         )
-    if json:
-        print_json(scene.describe().plain())
+    print_result(scene.describe().plain(), (), json)
 
 
 def run_extend(
@@ -340,11 +326,9 @@ def run_extend(
     known = None if data is None else opened.get(data, data)
     with interruptible_work():
         scene = extend(map, opened.get(new, new), known, split=images.split, steps=steps, config=config, device=device)
-    if json:
-        print_json(scene.describe().plain())
-        return
     added, total = len(scene.info.cameras) - len(info.cameras), len(scene.info.cameras)
-    show(f"{map}: {amount(added, 'photo')} added, {amount(total, 'image')} in all")
+    text = f"{map}: {amount(added, 'photo')} added, {amount(total, 'image')} in all"
+    print_result(scene.describe().plain(), [text], json)
 
 
 def _importer_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
@@ -421,5 +405,4 @@ def run_import(
     )
     with interruptible_work():
         scene = import_map(file, out, config, photos=photos, bake=not target.no_bake, options=options)
-    if json:
-        print_json(scene.describe().plain())
+    print_result(scene.describe().plain(), (), json)

@@ -42,6 +42,15 @@ def print_json(value: Any) -> None:
     sys.stdout.write(json.dumps(value, allow_nan=False) + "\n")
 
 
+def print_result(value: Any, lines: Iterable[str], json: bool) -> None:
+    """Print a result on stdout: ``value`` as a line of JSON, or as ``lines`` for readers."""
+    if json:
+        print_json(value)
+    else:
+        for line in lines:
+            show(line)
+
+
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], wide: str | None = None) -> None:
     """Print a table on stdout. On narrow terminals, the column ``wide`` is wrapped at words and the other columns are kept whole."""
     from rich.table import Table

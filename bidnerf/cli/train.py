@@ -21,7 +21,7 @@ from bidnerf.cli.options import (
     require_device,
     wrong_usage,
 )
-from bidnerf.cli.output import check_folder, print_json
+from bidnerf.cli.output import check_folder, print_result
 from bidnerf.cli.parser import Flag, Group, Option, SettingsGroup
 from bidnerf.cli.running import interruptible_work
 from bidnerf_core.datasets import DatasetOptions
@@ -70,8 +70,7 @@ def run_poses(
     given = _given_camera(camera, photos_camera)
     with interruptible_work("stopping (Ctrl-C again: at once); what was found is kept"):
         poses = POSERS.load(poser)(photos, out, given, overwrite)
-    if json:
-        print_json(to_plain(poses))
+    print_result(to_plain(poses), (), json)
 
 
 def _given_camera(camera: Any, options: CameraOptions) -> Any:
@@ -226,8 +225,7 @@ def run_train(
                 raise UsageError(error) from error
         else:
             scene = train(data, training.backend or USUAL_BACKEND, out, config, bake=bake, options=options)
-    if json:
-        print_json(scene.describe().plain())
+    print_result(scene.describe().plain(), (), json)
 
 
 def _interrupted(

@@ -76,7 +76,7 @@ def run_view(
 ) -> None:
     """View a map, and localizations in it, in a browser.
 
-    The page shows how and why a pose was found or rejected, also of photos that are dropped on it. Ctrl-C stops it. The photos and
+    The page shows how and why a pose was accepted or refused, also of photos that are dropped on it. Ctrl-C stops it. The photos and
     frames of QUERY can be selected there. Photos dropped on the page take the camera given here, whose field of view can be changed
     there. With --save, QUERY is localized immediately, and the saved page shows the same without a server.
     """

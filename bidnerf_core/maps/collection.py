@@ -40,7 +40,7 @@ _Scene = TypeVar("_Scene", bound=Map | str | Path)
 class Placement:
     """The map that an image shows, the pose of the image in that map, and the runner-up."""
 
-    map: str  # the map of the best answer, even if that was rejected
+    map: str  # the map of the best answer, even if that was refused
     found: Localization
     runner_up: tuple[str, Localization] | None  # the second best answer; None if only one map was tried
     # all maps, most similar first: the cosine between pooled descriptors, -1 if a map has none

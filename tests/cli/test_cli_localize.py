@@ -68,7 +68,7 @@ def test_a_folder_of_photos_is_localized_in_one_run(
     assert all(each["error"] is None and each["method"] == "bid" for each in found)
     assert err.count("focal length 32 px, as given") == 1  # the same camera is reported once
     assert err.count("skipped notes.txt") == 1
-    assert "of 3 converged" in err
+    assert "of 3 accepted" in err
     names = sorted(file.name for file in tmp_path.iterdir())
     assert names == [f"overlay-t_000{i}.png" for i in range(3)]
     pictures = [iio.imread(tmp_path / name) for name in names]
@@ -204,8 +204,8 @@ def test_without_an_accepted_pose_no_file_is_written(
     doubtful = [*place, given / "photos", *FOCAL, "--converged-loss", "0"]
     status, _, err = bidnerf(*doubtful, "--out", tmp_path / "poses.txt")
     assert status == 1
-    assert "no pose converged" in err
-    assert "0 of 3 converged" in err
+    assert "no pose was accepted" in err
+    assert "0 of 3 accepted" in err
     assert list(tmp_path.iterdir()) == []
     assert bidnerf(*doubtful, "--out", tmp_path / "none" / "poses.txt").status == 1
 

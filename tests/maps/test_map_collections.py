@@ -204,7 +204,7 @@ def test_the_command(bidnerf: Run, grounds: list[Map], tmp_path: Path, monkeypat
     assert len(loaded) == 2
     two = (tmp_path / "maps" / "m0", tmp_path / "maps" / "m4")
     out = bidnerf("localize", *two, file, "--focal", 130, "--out", tmp_path / "poses.json").succeed().out
-    assert out.startswith("photo: in m4: converged")
+    assert out.startswith("photo: in m4: accepted")
     assert "runner-up m0: too few matches" in out
     assert json.loads((tmp_path / "poses.json").read_text())[0]["map"] == "m4"
     for words in (("--out", tmp_path / "poses.txt"), ("--perturb", 1, 1)):
