@@ -41,7 +41,7 @@ from bidnerf_core.fields import (
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import lock
-from bidnerf_core.localization import Localizer as Localizer  # from the door, with maps to load
+from bidnerf_core.localization import Localizer as Localizer  # with maps to load, as bidnerf offers it
 from bidnerf_core.localization import move_map_to, origin_of, scene_of
 from bidnerf_core.mapping import (
     BakeConfig,
