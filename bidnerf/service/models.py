@@ -178,7 +178,7 @@ class Problem(BaseModel):
 class MapFacts(BaseModel):
     """Facts about a map."""
 
-    backend: str
+    backend: str | None = Field(description="of its field, or null if it has landmarks only")
     cameras: int = Field(ge=0)
     landmarks: int = Field(ge=0)
     surfels: int = Field(ge=0)

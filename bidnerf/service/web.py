@@ -8,7 +8,9 @@ import hmac
 import ipaddress
 import json
 import logging
+import re
 import time
+import uuid
 from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from importlib.resources import files
@@ -48,18 +50,21 @@ PROBLEM = "application/problem+json"
 CLIENT_GONE = 499
 """The status in the log and the metrics for a client that disconnected before the response; nobody receives it."""
 ERRORS = {
-    400: ("bad request", "The request is malformed: the detail states what was found and what is expected."),
-    401: ("no valid token", "The request does not carry the token of the service."),
-    403: ("not allowed", "Without a token, only programs on the service's own machine may send requests."),
-    404: ("not found", "There is no such thing."),
-    405: ("method not allowed", "The path lacks this method."),
-    408: ("upload too slow", "The request did not arrive in time."),
-    413: ("too large", "The request is too large."),
-    422: ("not localized", "The photo cannot be read or localized at all, or what is known about it contradicts it."),
-    429: ("too many requests", "The service is full."),
-    500: ("internal error", "An error in the service itself, which its log describes."),
-    503: ("not available", "The service cannot answer at present."),
-    504: ("took too long", "The answer took too long."),
+    400: ("Bad request", "The request is malformed: the detail states what was found and what is expected."),
+    401: ("No valid token", "The request does not carry the token of the service."),
+    403: ("Not allowed", "Without a token, only programs on the service's own machine may send requests."),
+    404: ("Not found", "There is no such thing."),
+    405: ("Method not allowed", "The path lacks this method."),
+    408: ("Upload too slow", "The request did not arrive in time."),
+    413: ("Too large", "The request is too large."),
+    422: (
+        "Unprocessable content",
+        "The photo cannot be read or localized at all, or what is known about it contradicts it.",
+    ),
+    429: ("Too many requests", "The service is full."),
+    500: ("Internal error", "An error in the service itself, which its log describes."),
+    503: ("Not available", "The service cannot answer at present."),
+    504: ("Took too long", "The answer took too long."),
 }
 """Titles and descriptions of errors, by HTTP status."""
 FaultReport = Callable[[Scope, int, float, Exception | None], None]
@@ -91,7 +96,9 @@ class Application(FastAPI):
             docs_url=None,
             redoc_url=None,
             redirect_slashes=False,
-            generate_unique_id_function=lambda route: f"{min(route.methods or ()).lower()} {route.path}",
+            generate_unique_id_function=lambda route: "_".join(
+                re.findall(r"\w+", f"{min(route.methods or ()).lower()} {route.path}")
+            ),
             separate_input_output_schemas=False,
             responses=error_responses(self.refused, 500),
             **more,
@@ -100,11 +107,11 @@ class Application(FastAPI):
         for kind in (Refused, InputError, HTTPException):
             self.add_exception_handler(kind, _answer_error)
 
-        @self.get("/openapi.json", summary="This description, in the format of OpenAPI 3.1.")
+        @self.get("/openapi.json", summary="Get this description in the format of OpenAPI 3.1.")
         async def openapi() -> dict[str, Any]:
             return self.openapi()
 
-        @self.get("/docs", summary="This description, as a page.", response_class=HTMLResponse)
+        @self.get("/docs", summary="Get this description as a page.", response_class=HTMLResponse)
         async def docs() -> HTMLResponse:
             template = files(__package__).joinpath("docs.html").read_text(encoding="utf-8")
             page = jinja2.Environment(autoescape=True).from_string(template).render(api=self.openapi())
@@ -154,7 +161,10 @@ class Gate:
             await self.app(scope, receive, send)
             return
         began, status, fault = time.perf_counter(), 0, None
-        served = {**scope, "method": "GET"} if scope["method"] == "HEAD" else scope
+        number = uuid.uuid4().hex
+        served = {**scope, "state": {**scope.get("state", {}), "id": number}}
+        if scope["method"] == "HEAD":
+            served["method"] = "GET"
 
         async def answer(message: Message) -> None:
             nonlocal status
@@ -162,6 +172,7 @@ class Gate:
                 status, headers = message["status"], MutableHeaders(raw=list(message["headers"]))
                 for name, value in SAFE.items():
                     headers.setdefault(name, value)
+                headers["X-Request-Id"] = number
                 message = {**message, "headers": headers.raw}
             await send(message)
 
@@ -199,7 +210,7 @@ class Gate:
 
 def problem(status: int, detail: str, headers: Mapping[str, str] | None = None, **more: Any) -> Response:
     """Return an error response in the format of RFC 9457."""
-    title = ERRORS[status][0] if status in ERRORS else "error"
+    title = ERRORS[status][0] if status in ERRORS else "Error"
     body = {"title": title, "status": status, "detail": detail, **more}
     return Response(json.dumps(body), status, headers, PROBLEM)
 

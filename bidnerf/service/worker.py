@@ -19,14 +19,16 @@ from io import BufferedRWPair
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel
+
 from bidnerf.results import Answer
 from bidnerf.results import localize as localize_photos
-from bidnerf.service.models import MapFacts, Refused, Upload
+from bidnerf.service.models import MapFacts, Refused, Upload, validate
 from bidnerf.service.protocols import PROTOCOLS
 from bidnerf.service.upload import public_message, read_upload
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.io import to_plain
+from bidnerf_core.io import parse_json, to_plain
 from bidnerf_core.localization import Localizer, settings_of
 from bidnerf_core.maps import Map, MapCollection, load_map
 
@@ -47,7 +49,7 @@ class LoadedMaps:
         described = dict[str, Any]()
         for name, localizer in self.localizers.items():
             scene = _scene(localizer)
-            facts = scene.describe().plain() | {"anchor": to_plain(scene.anchor)}
+            facts = scene.describe().plain() | {"anchor": to_plain(scene.anchor), "backend": scene.info.backend or None}
             described[name] = {key: facts[key] for key in MapFacts.model_fields}
         return described
 
@@ -55,7 +57,7 @@ class LoadedMaps:
         """Return the status and the body of the response to a request; the request's files may be written to ``folder``.
 
         ``task`` holds the name of the ``map``, or None for whichever map the photo shows, and either an ``upload`` or
-        the JSON ``body`` of a request to ``protocol``.
+        the ``body`` of a request to ``protocol``, as bytes.
         """
         outcomes = list[str]()
 
@@ -68,7 +70,8 @@ class LoadedMaps:
             if (protocol := task.get("protocol")) is None:
                 _, body = localize(task["upload"])
             else:
-                body = PROTOCOLS[protocol].answer(task["body"], _scene(self.localizers[task["map"]]), localize)
+                given = _validated(PROTOCOLS[protocol].request, task["body"])
+                body = PROTOCOLS[protocol].answer(given, _scene(self.localizers[task["map"]]), localize)
             reply: dict[str, Any] = {"status": 200, "body": body}
         except Refused as error:
             reply = {"status": error.status, "detail": error.detail, "more": error.more}
@@ -95,6 +98,16 @@ class LoadedMaps:
             answers = localize_photos(localizer, photos, start=lambda _: start, seed=upload.seed)
         (answer,) = answers.answers
         return answer, {**answers.plain(answer), "frame": upload.name}
+
+
+def _validated(model: type[BaseModel], body: bytes) -> Any:
+    """Return the JSON of a request. Raises ``Refused`` if it is malformed or does not match the model."""
+    try:
+        given = parse_json(body, "", "a JSON object")
+        validate(model, given)
+    except InputError as error:
+        raise Refused(400, str(error)) from error
+    return given
 
 
 def _scene(localizer: Localizer) -> Map:

@@ -179,7 +179,7 @@ class Service:
         description = operation["responses"][str(reply.status)]
         kinds = {kind.partition(";")[0] for kind in description["content"]}
         assert reply.headers["content-type"].partition(";")[0] in kinds
-        usual = {"content-type", "content-length", "connection", *map(str.lower, SAFE)}
+        usual = {"x-request-id", "content-type", "content-length", "connection", *map(str.lower, SAFE)}
         assert set(reply.headers) - usual == {name.lower() for name in description.get("headers", ())} - usual
         assert reply.headers.keys() >= set(map(str.lower, SAFE))
 
@@ -287,7 +287,18 @@ def test_a_registered_protocol_is_answered(service: Service, inputs: Inputs) -> 
         reply = service.post(path, json.dumps(question).encode(), "application/json")
         assert reply.json == {"frame": "echo", "cameras": service.get("/maps/hall").json["cameras"]}
     assert service.post("/echo", json.dumps(question).encode()).json["detail"].startswith("several maps")
-    assert "no 'photo'" in service.post("/maps/map/echo", b"{}").json["detail"]
+    for body, status, part in (
+        (b"{}", 400, "no 'photo'"),
+        (b"{", 400, "not JSON"),
+        (b"[" * 9000, 400, "not JSON"),
+        (
+            b'{"photo": [' + b"{}," * 10_001 + b"{}]}",
+            400,
+            "has 20,005 values, expected a JSON object of at most 10,000",
+        ),
+    ):
+        refused = service.post("/maps/map/echo", body)
+        assert (refused.status, part in refused.json["detail"]) == (status, True), refused.body
     assert service.get("/maps/map/echo").json == {"status": "running"}
     assert service.post("/echo?map=", json.dumps(question).encode()).status == 404
     refused = service.get("/echo", "PUT")

@@ -14,7 +14,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 class _Part(BaseModel):
-    """A part of a request: keys that are null count as missing, and numbers are not texts."""
+    """A part of a request: keys that are null count as missing, and numbers are not texts.
+
+    Keys that are not declared are ignored: clients also send readings of sensors that do not help here.
+    """
 
     model_config = ConfigDict(strict=True, allow_inf_nan=False)
 
@@ -67,7 +70,7 @@ class CameraParameters(_Part):
     """A camera model of COLMAP, and its parameters."""
 
     model: str = "UNKNOWN_CAMERA"
-    modelParams: list[float] = []
+    modelParams: list[float] = Field([], max_length=20)
 
 
 class Orientation(_Part):
@@ -109,9 +112,9 @@ class GeoPoseRequest(_Part):
     id: str = ""
     timestamp: float = 0.0
     type: str = ""
-    sensors: list[Sensor] = []
+    sensors: list[Sensor] = Field([], max_length=100)
     sensorReadings: SensorReadings
-    priorPoses: list[Prior] = []
+    priorPoses: list[Prior] = Field([], max_length=100)
 
 
 class Accuracy(BaseModel):
