@@ -14,7 +14,7 @@ from bidnerf.cli.options import (
     Device,
     Frames,
     Json,
-    Localization,
+    MethodGroup,
     MethodOptions,
     Names,
     NoDepth,
@@ -135,7 +135,7 @@ def run_evaluate(
     input: Annotated[InputOptions, Group("input", "What the method receives of each frame.")],
     work: Annotated[WorkOptions, Group("work", "Where the trials are run.")],
     images: SeenImages = TEST_IMAGES,
-    method: Localization,
+    method: MethodGroup,
     json: Json = False,
 ) -> None:
     """Localize many frames of a dataset, and write one JSON line a trial.
@@ -190,7 +190,7 @@ def run_compare(
     overwrite: Overwrite = False,
     device: Device = "cpu",
     images: SeenImages = TEST_IMAGES,
-    method: Localization,
+    method: MethodGroup,
 ) -> None:
     """Localize the same frames in several maps, and compare the results.
 

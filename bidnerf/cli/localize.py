@@ -14,8 +14,8 @@ from bidnerf.cli.options import (
     TEST_IMAGES,
     Device,
     Json,
-    Localization,
     MapFolder,
+    MethodGroup,
     Overwrite,
     Queries,
     Seed,
@@ -127,7 +127,7 @@ def run_localize(
     queries: Queries,
     images: SeenImages = TEST_IMAGES,
     start: Annotated[StartOptions, Group("start", "Where localization starts. By default, it needs no start.")],
-    method: Localization,
+    method: MethodGroup,
     device: Device = "cpu",
     seed: Seed = 0,
 ) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 from bidnerf.cli.parser import FLAG, Group, Option, SettingsGroup, Without, as_usage_error
 from bidnerf_core import datasets, mapping
+from bidnerf_core.datasets import TEST_IMAGES as TEST_IMAGES
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.registry import USUAL_FEATURES, USUAL_METHOD, Plugins
@@ -20,10 +21,8 @@ if TYPE_CHECKING:
     from bidnerf_core.datasets import DatasetFrames, Photos
     from bidnerf_core.io import Background
 
-TEST_IMAGES = DatasetOptions(split="test")
-"""The default options for images with which a map is tested."""
-Images: TypeAlias = Annotated[DatasetOptions, Group("images", "How the images and their depth are read.")]
-MappedImages: TypeAlias = Annotated[Images, Without("background")]  # in the map, which has a background
+ImageOptions: TypeAlias = Annotated[DatasetOptions, Group("images", "How the images and their depth are read.")]
+MappedImages: TypeAlias = Annotated[ImageOptions, Without("background")]  # in the map, which has a background
 SeenImages: TypeAlias = Annotated[MappedImages, Without("largest")]  # localized at the size that the method chooses
 WholeImages: TypeAlias = Annotated[SeenImages, Without("masks", "mask_hides")]  # of which every pixel counts
 ColourImages: TypeAlias = Annotated[WholeImages, Without("register_depth", "depth_unit")]  # whose depth is not used
@@ -71,7 +70,7 @@ def pose_file_help() -> str:
     return f"write the poses to this file, in the format of its ending: {names}; .json has all details"
 
 
-Method: TypeAlias = Annotated[
+MethodName: TypeAlias = Annotated[
     str, installed("methods"), Option("NAME", "method that finds poses, one of 'bidnerf plugins methods'")
 ]
 Overwrite: TypeAlias = Annotated[bool, FLAG, Option(None, "replace output that exists")]
@@ -88,7 +87,7 @@ def _method_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
 class MethodOptions:
     """How poses are found."""
 
-    method: Method = USUAL_METHOD
+    method: MethodName = USUAL_METHOD
     preset: Annotated[
         str | None,
         EXPERT,
@@ -100,7 +99,7 @@ class MethodOptions:
     ] = None
 
 
-Localization: TypeAlias = Annotated[MethodOptions, Group("localization", "How poses are found.")]
+MethodGroup: TypeAlias = Annotated[MethodOptions, Group("localization", "How poses are found.")]
 
 
 @dataclass(frozen=True)
@@ -181,11 +180,11 @@ class CameraOptions:
         return CameraSource(camera, self.focal, self.hfov, tuple(assumed))
 
 
-CameraGroup: TypeAlias = Annotated[
+PhotoCamera: TypeAlias = Annotated[
     CameraOptions,
     Group("camera", "The camera of photos without one of their own. By default, it comes from EXIF or from the map."),
 ]
-NewCameraGroup: TypeAlias = Annotated[
+NewPhotoCamera: TypeAlias = Annotated[
     CameraOptions,
     Group("camera", "The camera of photos without poses. By default, it is estimated, starting from EXIF."),
 ]
@@ -206,7 +205,7 @@ class QueryOptions:
         WholeNumbers(1),
         Option("K", "combine each frame with those before it in the split, K in all, as a rig"),
     ] = 1
-    camera: CameraGroup = CameraOptions()
+    camera: PhotoCamera = CameraOptions()
 
     def __post_init__(self) -> None:
         twice = next((name for name in self.frame if self.frame.count(name) > 1), None)

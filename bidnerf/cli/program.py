@@ -31,7 +31,7 @@ def _command_defects(command: Any) -> Iterator[str]:
 
 COMMANDS: Plugins[Callable[..., None]] = Plugins("commands", _command_defects)
 """The functions that run the installed commands, by name."""
-DONE, BAD_INPUT, WRONG_USAGE, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
+DONE, BAD_DATA, WRONG_USAGE, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
 """Exit statuses; the last two are 128 plus the number of the signal, as is customary for shells. SIGTERM and SIGHUP lead to
 143 and 129."""
 
@@ -61,13 +61,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return READER_GONE
     except OSError as error:  # a full disk, a folder without write permission
         where = f"{error.filename}: " if error.filename else ""
-        return _report(name, f"{where}{error.strerror or error}", BAD_INPUT)
+        return _report(name, f"{where}{error.strerror or error}", BAD_DATA)
     except InputError as error:
-        return _report(name, str(error), WRONG_USAGE if isinstance(error, UsageError) else BAD_INPUT)
+        return _report(name, str(error), WRONG_USAGE if isinstance(error, UsageError) else BAD_DATA)
     except RuntimeError as error:
         if type(error).__name__ != "OutOfMemoryError":  # torch's class; importing torch would delay --help
             raise
-        return _report(name, f"the GPU's memory is full, try --device cpu ({error})", BAD_INPUT)
+        return _report(name, f"the GPU's memory is full, try --device cpu ({error})", BAD_DATA)
     finally:
         try:
             sys.stdout.flush()
@@ -95,7 +95,7 @@ def _dispatch(given: list[str]) -> int:
     try:
         parse(given[0], command, given[1:])
     except SystemExit as stopped:  # after help, or from a plugin
-        return stopped.code if isinstance(stopped.code, int) else DONE if stopped.code is None else BAD_INPUT
+        return stopped.code if isinstance(stopped.code, int) else DONE if stopped.code is None else BAD_DATA
     return DONE
 
 

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from bidnerf.cli.options import (
-    CameraGroup,
     Device,
     Json,
     MapFolder,
     NoDepth,
     Overwrite,
+    PhotoCamera,
     SeenImages,
     pose_file_help,
     require_device,
@@ -77,7 +77,7 @@ def run_track(
     json: Json = False,
     *,
     frames: Annotated[FrameOptions, Group("frames", "Which frames are tracked, and whether their depth is used.")],
-    camera: CameraGroup,
+    camera: PhotoCamera,
     images: Annotated[SeenImages, Without("split")],
     device: Device = "cpu",
     tracking: Annotated[TrackingOptions, Group("tracking", "How tracking begins, and which poses it accepts.")],

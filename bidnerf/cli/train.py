@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 from bidnerf.cli.options import (
     CameraOptions,
-    Images,
+    ImageOptions,
     Json,
     MapOutput,
-    NewCameraGroup,
     NewMap,
+    NewPhotoCamera,
     Overwrite,
     PointChoice,
     installed,
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from bidnerf_core.maps import MapInfo
 
 
-Poser: TypeAlias = Annotated[
+PoserName: TypeAlias = Annotated[
     str,
     EXPERT,
     installed("posers"),
@@ -52,11 +52,11 @@ def run_poses(
             "estimated, starting from EXIF",
         ),
     ] = None,
-    poser: Poser = USUAL_POSER,
+    poser: PoserName = USUAL_POSER,
     overwrite: Overwrite = False,
     json: Json = False,
     *,
-    photos_camera: NewCameraGroup,
+    photos_camera: NewPhotoCamera,
 ) -> None:
     """Find the poses of photos by structure from motion.
 
@@ -131,7 +131,7 @@ class PoseOptions:
             "refine the given poses with the keypoints that images share: always, never, or auto (if inconsistent)",
         ),
     ] = "auto"
-    poser: Poser = USUAL_POSER
+    poser: PoserName = USUAL_POSER
     trust_poses: Annotated[
         Flag, EXPERT, Option(None, "train even if the given poses contradict most pairs of photos")
     ] = False
@@ -158,9 +158,9 @@ def run_train(
     training: Annotated[TrainingOptions, Group("training", "Which field is trained, and how long.")],
     target: NewMap,
     given_poses: Annotated[PoseOptions, Group("poses", "What happens to the poses of the dataset.")],
-    photos_camera: NewCameraGroup,
+    photos_camera: NewPhotoCamera,
     sparse_depth: Annotated[DepthPointsOptions, Group("sparse depth", "Depth for images that have none.")],
-    images: Images,
+    images: ImageOptions,
     config: Annotated[
         Any,
         SettingsGroup(

@@ -13,7 +13,7 @@ from bidnerf.cli.options import (
     Device,
     Host,
     MapFolder,
-    Method,
+    MethodName,
     Overwrite,
     Port,
     Queries,
@@ -57,9 +57,9 @@ class ServerOptions:
     """The server of the page."""
 
     host: Host = None
-    port: Port = viewer.PORT
+    port: Port = viewer.VIEWER_PORT
     device: Device = "cpu"
-    method: Method = USUAL_METHOD
+    method: MethodName = USUAL_METHOD
 
 
 def run_view(
@@ -169,7 +169,7 @@ def run_serve(
             "none, but with --host one is generated and printed",
         ),
     ] = None,
-    method: Method = USUAL_METHOD,
+    method: MethodName = USUAL_METHOD,
     device: Device = "cpu",
     *,
     limits: Annotated[

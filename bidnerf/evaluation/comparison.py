@@ -40,7 +40,7 @@ from bidnerf_core.frames import View, draw, uniform
 from bidnerf_core.geometry import SE3, symbol
 from bidnerf_core.io import to_plain, write_file
 from bidnerf_core.localization import origin_of
-from bidnerf_core.maps import DESCRIPTION, Images, Map, load_info, name_maps
+from bidnerf_core.maps import DESCRIPTION, Map, ViewSource, load_info, name_maps
 from bidnerf_core.progress import (
     Cancel,
     Progress,
@@ -147,7 +147,7 @@ class Comparison:
 
 def compare(
     scenes: Sequence[MapSource] | Mapping[str, MapSource],
-    data: Images,
+    data: ViewSource,
     plan: Plan | None = None,
     *,
     progress: ProgressCallback | None = None,

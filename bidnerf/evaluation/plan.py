@@ -18,7 +18,7 @@ from pydantic_core import core_schema
 
 from bidnerf.evaluation.faults import NO_FAULT, check_depth, expand_faults
 from bidnerf.scenes import is_closed_form
-from bidnerf_core.datasets import Capture, DatasetOptions, describe_other_split
+from bidnerf_core.datasets import TEST_IMAGES, Capture, DatasetOptions, describe_other_split
 from bidnerf_core.errors import InputError, InputWarning, amount, unknown_name
 from bidnerf_core.frames import INVERTED
 from bidnerf_core.geometry import SE3, perturb, random_units
@@ -147,7 +147,6 @@ StoredOptions = Annotated[
     # pydantic cannot resolve the annotations of ``DatasetOptions``, which names types that it does not import.
     GetPydanticSchema(lambda kind, handler: core_schema.no_info_plain_validator_function(_read_options)),
 ]
-TEST_IMAGES = DatasetOptions(split="test")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,7 +174,7 @@ class Setup:
                 raise InputError(f"{name} holds a NUL character", expected="the name of a file or folder")
 
 
-USUAL = Setup()
+USUAL_SETUP = Setup()
 
 
 @dataclass(frozen=True)

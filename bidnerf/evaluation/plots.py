@@ -78,7 +78,7 @@ QUANTITIES = {
         lambda r, criterion: steps_of([r], criterion)[0] if applies(criterion, [r]) else NEVER,
     ),
 }
-ERRORS = ("translation", "rotation_deg")
+POSE_ERRORS = ("translation", "rotation_deg")
 
 Panel = tuple[str, Callable[[Any], None]]
 """The title of a panel, and the function that draws it."""
@@ -115,11 +115,11 @@ class Figures:
 
     def cumulative(self) -> list[Callable[..., None]]:
         """Return functions that draw the cumulative share of trials over each kind of error, and over time."""
-        return [partial(self._shares, of=of) for of in (*ERRORS, "seconds")]
+        return [partial(self._shares, of=of) for of in (*POSE_ERRORS, "seconds")]
 
     def convergence(self) -> Figure | None:
         """Draw errors and success after each step, for methods that work in steps; None if there are none."""
-        draw = [*(partial(self._quartiles, kind=kind) for kind in ERRORS), partial(self._shares, of="steps")]
+        draw = [*(partial(self._quartiles, kind=kind) for kind in POSE_ERRORS), partial(self._shares, of="steps")]
         return self._by_situation(
             "convergence",
             [group for group in self.groups if are_stepwise(group.results)],

@@ -49,7 +49,7 @@ from bidnerf_core.settings import to_flat
 
 LARGEST_FILE = 512 * 2**20
 """Largest size of a file of results in bytes. A trial takes a few kilobytes, so that a hundred thousand trials fit."""
-EXPECTED = "lines as written by 'bidnerf evaluate'"
+EXPECTED_RESULTS = "lines as written by 'bidnerf evaluate'"
 BEGINNING = b'{"T_world_camera": '
 """The beginning of each line of a file of results."""
 
@@ -124,7 +124,7 @@ def read_results(paths: Iterable[Path]) -> list[TrialResult]:
     """
     results: dict[Any, TrialResult] = {}
     for path in paths:
-        for result in _parse(path, read_file(path, EXPECTED, LARGEST_FILE))[0]:
+        for result in _parse(path, read_file(path, EXPECTED_RESULTS, LARGEST_FILE))[0]:
             results.setdefault((key_of(result.trial), result.weights, result.inputs), result)
     return list(results.values())
 
@@ -135,7 +135,7 @@ def _parse(path: Path, content: bytes) -> tuple[list[TrialResult], int]:
     for number, line in enumerate(lines, start=1):
         where = f"{path}: line {number}"
         try:
-            plain = parse_json(line, where, EXPECTED) if line.strip() else None
+            plain = parse_json(line, where, EXPECTED_RESULTS) if line.strip() else None
         except InputError:
             # The last line is dropped only if it begins as a result does, so that no unrelated file is truncated.
             if number == len(lines) and (line.startswith(BEGINNING) or BEGINNING.startswith(line)):
@@ -165,7 +165,7 @@ class ResultsFile:
             return self
         file = self._open(self.path)
         try:
-            content = read_open_file(file, self.path, EXPECTED, LARGEST_FILE)
+            content = read_open_file(file, self.path, EXPECTED_RESULTS, LARGEST_FILE)
             results, complete = _parse(self.path, content)
             for result in results:
                 self.values.setdefault(key_of(result.trial), result)
@@ -227,7 +227,7 @@ class ResultsFile:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             if path.exists():
-                open_binary(path, EXPECTED).close()  # raises for a pipe, which would wait for a reader
+                open_binary(path, EXPECTED_RESULTS).close()  # raises for a pipe, which would wait for a reader
             self._file = path.open("a+b")
         except OSError as error:
             raise InputError(f"cannot be written ({error.strerror})", where=path, expected="a file") from error

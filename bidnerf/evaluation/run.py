@@ -38,7 +38,7 @@ from bidnerf_core.errors import Cancelled, InputError, amount
 from bidnerf_core.fields import device_of
 from bidnerf_core.io import usable_cores
 from bidnerf_core.localization import find_method
-from bidnerf_core.maps import Images, Map
+from bidnerf_core.maps import Map, ViewSource
 from bidnerf_core.progress import (
     Cancel,
     Progress,
@@ -64,7 +64,7 @@ CHANGED = {
 
 def evaluate(
     scene: MapSource,
-    data: Images,
+    data: ViewSource,
     plan: Plan | None = None,
     *,
     out: str | Path | None = None,
@@ -103,7 +103,7 @@ def evaluate(
             return ResultTable(tuple(file[trial] for trial in trials))
 
 
-def data_name(data: Images, dataset: Capture) -> str:
+def data_name(data: ViewSource, dataset: Capture) -> str:
     """Return the name of a dataset in results: its folder as given, or the path of a dataset in memory."""
     return str(data if isinstance(data, str | Path) else dataset.path)
 

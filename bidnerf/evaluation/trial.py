@@ -22,7 +22,7 @@ from typing import Any, TypeAlias
 import torch
 
 from bidnerf.evaluation.faults import faulty, parse_faults
-from bidnerf.evaluation.plan import USUAL, Setup, Trial, find_protocol, parse_settings
+from bidnerf.evaluation.plan import USUAL_SETUP, Setup, Trial, find_protocol, parse_settings
 from bidnerf.results import PoseError, plain_localization, pose_error
 from bidnerf.scenes import closed_form_data, closed_form_map, is_closed_form
 from bidnerf_core.camera import Intrinsics
@@ -33,7 +33,7 @@ from bidnerf_core.frames import View
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import from_plain, to_plain
 from bidnerf_core.localization import Localizer
-from bidnerf_core.maps import DESCRIPTION, Images, Map, load_map
+from bidnerf_core.maps import DESCRIPTION, Map, ViewSource, load_map
 from bidnerf_core.registry import registered_names, require_registered
 from bidnerf_core.settings import to_flat
 
@@ -189,7 +189,7 @@ def open_map(name: str, device: str = "cpu") -> Map:
     return closed_form_map(name) if is_closed_form(name) else load_map(Path(name), where)
 
 
-def open_data(data: Images, options: DatasetOptions, stored: Map | None = None) -> Capture:
+def open_data(data: ViewSource, options: DatasetOptions, stored: Map | None = None) -> Capture:
     """Return a dataset, read from its folder unless it is in memory or demo:NAME; ``stored`` gives the background colour.
 
     Raises ``InputError`` for ``data`` of another type, and for options about files with data that has no files.
@@ -217,7 +217,7 @@ def open_data(data: Images, options: DatasetOptions, stored: Map | None = None) 
     return capture if options.mask_folder is None else capture.with_masks(options.mask_folder)
 
 
-def open_scene(source: MapSource, data: Images, setup: Setup = USUAL) -> Scene:
+def open_scene(source: MapSource, data: ViewSource, setup: Setup = USUAL_SETUP) -> Scene:
     """Return a map and a dataset, each read from its folder unless it is in memory.
 
     If both are in folders, they are read once per process unless the map has changed since.

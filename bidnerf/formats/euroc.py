@@ -32,7 +32,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.io import is_file, parse_yaml, read_file
 
 TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0", "gt0")
-EXPECTED = "EuRoC's sensor.yaml"
+EXPECTED_SENSOR = "EuRoC's sensor.yaml"
 
 
 def _read(path: Path, root: Path, options: DatasetOptions) -> Capture:
@@ -57,9 +57,9 @@ def _find(path: Path) -> Path | None:
 
 def _sensor(file: Path, options: DatasetOptions) -> tuple[CameraSource, SE3]:
     """Return the camera (given or calibrated) and T_body_camera. Raises ``InputError`` for an invalid file."""
-    values = parse_yaml(read_file(file, EXPECTED), str(file), EXPECTED)
+    values = parse_yaml(read_file(file, EXPECTED_SENSOR), str(file), EXPECTED_SENSOR)
     if not isinstance(values, dict):
-        raise InputError("has no entries", where=file, expected=EXPECTED)
+        raise InputError("has no entries", where=file, expected=EXPECTED_SENSOR)
 
     def numbers(key: str, count: int) -> list[float]:
         """Return the numbers of a list, which may be the ``data`` of a matrix."""

@@ -21,7 +21,7 @@ from bidnerf_core.frames import photos_in
 from bidnerf_core.geometry import rigid_pose
 from bidnerf_core.io import read_array
 
-POSES = "poses_bounds.npy"
+POSES_FILE = "poses_bounds.npy"
 
 
 def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
@@ -50,8 +50,8 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
 
 reader = Format(
     "LLFF and Mip-NeRF 360, without depth",
-    f"images with {POSES} (LLFF)",
-    lambda path: first_file(path, POSES),
+    f"images with {POSES_FILE} (LLFF)",
+    lambda path: first_file(path, POSES_FILE),
     _read,
     precedence=16,  # made from a COLMAP model, without the distortion of its lens
 )

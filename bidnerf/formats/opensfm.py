@@ -33,7 +33,7 @@ from bidnerf_core.frames import natural_order
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import Record, is_file, read_json
 
-KINDS = ("perspective", "brown", "simple_radial", "radial", "fisheye_opencv")
+PROJECTIONS = ("perspective", "brown", "simple_radial", "radial", "fisheye_opencv")
 """The projection types that are read, besides panoramas."""
 
 
@@ -93,8 +93,8 @@ def _camera(record: Record) -> Camera:
         raise record.error("no width and height", expected="the size of its images")
     if kind in ("spherical", "equirectangular"):
         return PanoramaFace("front", (width, height))
-    if kind not in KINDS:
-        raise record.error(f"projection_type is {kind}", expected=f"one of {', '.join(KINDS)}")
+    if kind not in PROJECTIONS:
+        raise record.error(f"projection_type is {kind}", expected=f"one of {', '.join(PROJECTIONS)}")
     side, focal = max(width, height), record.number("focal")
     fx, fy = (record.number(key) or focal for key in ("focal_x", "focal_y"))
     if fx is None or fy is None:

@@ -31,8 +31,8 @@ from bidnerf_core.errors import amount
 from bidnerf_core.frames import natural_order, photos_in
 from bidnerf_core.io import is_file, read_header, read_record
 
-LENS = ("fx", "fy", "cx", "cy")
-POSE = [[f"t_{row}{column}" for column in range(4)] for row in range(3)]
+LENS_KEYS = ("fx", "fy", "cx", "cy")
+POSE_KEYS = [[f"t_{row}{column}" for column in range(4)] for row in range(3)]
 
 
 def _read(path: Path, cameras: Path, options: DatasetOptions) -> Capture:
@@ -54,9 +54,9 @@ def _read(path: Path, cameras: Path, options: DatasetOptions) -> Capture:
         if not is_file(photo):
             shots.append(Shot(image=photo))
             continue
-        rows = [[record.number(key) for key in row] for row in POSE]
-        lens = [number for key in LENS if (number := record.number(key)) is not None]
-        if len(lens) < len(LENS) or any(number is None for row in rows for number in row):
+        rows = [[record.number(key) for key in row] for row in POSE_KEYS]
+        lens = [number for key in LENS_KEYS if (number := record.number(key)) is not None]
+        if len(lens) < len(LENS_KEYS) or any(number is None for row in rows for number in row):
             raise record.error(
                 "is incomplete", expected="fx, fy, cx, cy, and t_00 to t_23, the rows of the camera's pose"
             )

@@ -33,14 +33,14 @@ from bidnerf_core.frames import natural_order
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import Row, is_file, open_binary, read_header
 
-POSE = ("x", "y", "alt", "heading", "pitch", "roll")
+POSE_FIELDS = ("x", "y", "alt", "heading", "pitch", "roll")
 
 
 def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
     """Read the list. Raises ``InputError`` if a row is invalid."""
     columns = "the columns of the export 'Internal/External camera parameters', which has focal lengths (f)"
     names = FileNames(path, path / "images", path / "input")
-    rows = read_table(file, "a list of cameras", columns, {"name", "f", *POSE})
+    rows = read_table(file, "a list of cameras", columns, {"name", "f", *POSE_FIELDS})
     shots = [_shot(row, values, names.path(values["name"], IMAGE_ENDINGS)) for row, values in rows]
     shots.sort(key=lambda shot: natural_order(f"{shot.file}"))
     return Capture(path, shots, options.colour, pose_file=file)
@@ -49,7 +49,7 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
 def _find(path: Path) -> Path | None:
     for file, head in file_heads(path, "*.csv", "a list of cameras"):
         names = column_names(head.partition(b"\n")[0].decode("utf-8-sig", "replace"))
-        if names[:1] == ["name"] and set(POSE) <= set(names):
+        if names[:1] == ["name"] and set(POSE_FIELDS) <= set(names):
             return file
     return None
 
@@ -67,7 +67,7 @@ def _shot(row: Row, values: dict[str, str], image: Path) -> Shot:
 
     angles = [-number("heading"), number("pitch"), number("roll")]
     turn = torch.from_numpy(Rotation.from_euler("ZXY", angles, degrees=True).as_matrix())
-    position = torch.tensor([number(key) for key in POSE[:3]], dtype=torch.float64)
+    position = torch.tensor([number(key) for key in POSE_FIELDS[:3]], dtype=torch.float64)
     pose = SE3(turn * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64), position)
     if number("k4") != 0:
         raise row.error(": k4 is not 0, which OpenCV's model does not support; export undistorted images instead")

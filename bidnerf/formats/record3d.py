@@ -27,7 +27,7 @@ from bidnerf_core.depth import DepthImage, depth_image
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import Archive, ImageSource, Record, is_file, parse_record, read_file
 
-EXPECTED = "a Record3D recording (.r3d)"
+EXPECTED_RECORDING = "a Record3D recording (.r3d)"
 
 
 class Recording:
@@ -35,13 +35,13 @@ class Recording:
 
     def __init__(self, path: Path) -> None:
         self.path, self._lidar = path, lidar.LidarDepth()
-        self._archive = None if path.is_dir() else Archive(path, EXPECTED)
+        self._archive = None if path.is_dir() else Archive(path, EXPECTED_RECORDING)
 
     def __contains__(self, name: str) -> bool:
         return is_file(self.path / name) if self._archive is None else name in self._archive
 
     def read(self, name: str) -> bytes:
-        return read_file(self.path / name, EXPECTED) if self._archive is None else self._archive.read(name)
+        return read_file(self.path / name, EXPECTED_RECORDING) if self._archive is None else self._archive.read(name)
 
     def file(self, name: str) -> ImageSource:
         """Return a file of the recording: an archive member, read when opened, or the path where it is expected in the folder."""

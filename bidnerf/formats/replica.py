@@ -28,7 +28,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames import natural_order
 from bidnerf_core.io import Record, is_file, read_record, read_rows
 
-KEYS = ("fx", "fy", "cx", "cy", "scale")
+CAMERA_KEYS = ("fx", "fy", "cx", "cy", "scale")
 
 
 def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
@@ -67,9 +67,9 @@ def _camera(path: Path) -> tuple[Intrinsics, float]:
     record = read_record(file)
     camera = record.value("camera")
     own = record if not isinstance(camera, dict) else Record(f"{file}: camera", camera)
-    numbers, width, height = [own.number(key) or 0.0 for key in KEYS], own.size("w"), own.size("h")
+    numbers, width, height = [own.number(key) or 0.0 for key in CAMERA_KEYS], own.size("w"), own.size("h")
     if not all(numbers) or width is None or height is None or numbers[4] < 0:
-        raise own.error("is incomplete", expected=f"w, h, {', '.join(KEYS)}")
+        raise own.error("is incomplete", expected=f"w, h, {', '.join(CAMERA_KEYS)}")
     return camera_of(own.where, numbers[:4], (width, height)), 1 / numbers[4]
 
 

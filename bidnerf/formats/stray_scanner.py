@@ -29,7 +29,7 @@ from bidnerf_core.datasets import (
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import is_file, read_rows
 
-POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 LENS = ("fx", "fy", "cx", "cy")
 
 
@@ -41,7 +41,7 @@ def _read(path: Path, odometry: Path, options: DatasetOptions) -> Capture:
     """
     video, read, shots = Video(path / "rgb.mp4"), lidar.LidarDepth(), list[Shot]()
     columns = "timestamp, frame, x, y, z, qx, qy, qz, qw"
-    rows = read_table(odometry, "Stray Scanner's odometry", columns, {"timestamp", "frame", *POSE})
+    rows = read_table(odometry, "Stray Scanner's odometry", columns, {"timestamp", "frame", *POSE_COLUMNS})
     matrix, columns = path / "camera_matrix.csv", "3 rows of 3 numbers"
     lines = read_rows(matrix, "Stray Scanner's camera matrix", columns)
     numbers = [line.numbers(line.text.replace(",", " ").split(), 3) for line in lines]
@@ -52,7 +52,7 @@ def _read(path: Path, odometry: Path, options: DatasetOptions) -> Capture:
         number = row.integer(words["frame"])
         own = row.plain_numbers([words[key] for key in LENS]) if all(map(words.get, LENS)) else None
         where, stem = str(matrix) if own is None else row.where, f"{number:06d}"
-        pose = row.plain_numbers([words[name] or "nan" for name in POSE])
+        pose = row.plain_numbers([words[name] or "nan" for name in POSE_COLUMNS])
         # The first versions wrote depth as .npy.
         depth = first_file(path / "depth", f"{stem}.png", f"{stem}.npy")
         confidence = first_file(path / "confidence", f"{stem}.png")

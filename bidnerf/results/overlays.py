@@ -18,7 +18,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.io import reduce_image, write_file
 from bidnerf_core.localization import Localization, SceneMap, Start, origin_of, scene_of, start_pose
 
-SIDE = 240
+PICTURE_SIDE = 240
 """Pixels along the longer side of pictures drawn in large numbers, since each rendered pixel takes time; also the width
 to which smaller images are enlarged, so that captions fit."""
 
@@ -51,7 +51,7 @@ def overlay(
 class Painter:
     """Draws overlays of one photo, downscaled to at most ``side`` pixels a side, with renderings of a map."""
 
-    def __init__(self, map: SceneMap, frame: Frame, side: int = SIDE) -> None:
+    def __init__(self, map: SceneMap, frame: Frame, side: int = PICTURE_SIDE) -> None:
         scale = side / max(frame.intrinsics.width, frame.intrinsics.height)
         self._map = map
         self._camera = frame.intrinsics if scale >= 1 else frame.intrinsics.scaled(scale)
@@ -112,7 +112,7 @@ def edges(image: ArrayLike | Tensor) -> Float[np.ndarray, "h w"]:
 def tile(image: ArrayLike | Tensor, caption: str) -> UInt8[np.ndarray, "H W 3"]:
     """Return the image on white, enlarged if it is small, with its caption above it."""
     picture, top, gap = Image.fromarray(as_picture(image)), 22, 6
-    scale = max(1, round(SIDE / picture.width))
+    scale = max(1, round(PICTURE_SIDE / picture.width))
     picture = picture.resize((picture.width * scale, picture.height * scale), Image.Resampling.NEAREST)
     canvas = Image.new("RGB", (picture.width + gap, picture.height + top + gap), (255, 255, 255))
     draw, corner = ImageDraw.Draw(canvas), (gap // 2 + picture.width, top + picture.height)

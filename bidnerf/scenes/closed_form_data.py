@@ -28,7 +28,7 @@ from bidnerf_core.maps import Map, MapInfo
 
 PREFIX = "demo:"
 DEMO_CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
-FRAMES = 24
+FRAME_COUNT = 24
 
 Render = Callable[[SE3, str], Frame]
 
@@ -89,13 +89,13 @@ def closed_form_data(name: str) -> ClosedFormData:
     _check(name, ("blobs", "object", "room"), "data")
     training, middle = list[SE3](), (0.0, 0.0, 0.0)
     if name == "demo:blobs":
-        poses, render, background = orbit(3.5, FRAMES, seed=1), _render_blobs, BLOBS.background
+        poses, render, background = orbit(3.5, FRAME_COUNT, seed=1), _render_blobs, BLOBS.background
     else:
         is_room = name == "demo:room"
         scene = demo_room() if is_room else demo_object()
-        poses, training = orbit(3.5, FRAMES, elevation=(15.0, 50.0), seed=1), orbit(3.5, 40)
+        poses, training = orbit(3.5, FRAME_COUNT, elevation=(15.0, 50.0), seed=1), orbit(3.5, 40)
         if is_room:
-            poses, training = look_around(scene.bounds, FRAMES, seed=1), look_around(scene.bounds, 40)
+            poses, training = look_around(scene.bounds, FRAME_COUNT, seed=1), look_around(scene.bounds, 40)
             middle = (0.0, 0.0, 1.25)
         render, background = partial(scene.render, DEMO_CAMERA), scene.bounds.background
     shots = [

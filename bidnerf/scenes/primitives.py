@@ -19,7 +19,7 @@ from torch import Tensor
 
 from bidnerf_core.geometry import SE3
 
-Colour = tuple[float, float, float]
+Rgb = tuple[float, float, float]
 Vector = tuple[float, float, float]
 Texture = Callable[[Tensor, Tensor], Tensor]
 """A function from points (n 3; metres, frame of the shape) and outward unit normals (n 3) to colours (n 3) in [0, 1]."""
@@ -33,8 +33,8 @@ class Waves:
     a pose that is off by one period does not fit.
     """
 
-    first: Colour
-    second: Colour
+    first: Rgb
+    second: Rgb
     waves: tuple[Vector, ...]
     phases: tuple[float, ...]
     hardness: float  # slope of the edges: higher is sharper
@@ -67,21 +67,21 @@ class Faces:
         return rgb
 
 
-def checker(first: Colour, second: Colour, period: float | Vector, phase: float = 0.7) -> Waves:
+def checker(first: Rgb, second: Rgb, period: float | Vector, phase: float = 0.7) -> Waves:
     """Return a texture of soft cubes of alternating colour; ``period`` (metres) is twice the side of a cube, for all axes or per axis."""
     px, py, pz = period if isinstance(period, tuple) else (period,) * 3
     waves = ((2 * math.pi / px, 0.0, 0.0), (0.0, 2 * math.pi / py, 0.0), (0.0, 0.0, 2 * math.pi / pz))
     return Waves(first, second, waves, (phase, phase + 0.5, phase + 0.9), hardness=5.0)
 
 
-def stripes(first: Colour, second: Colour, across: Vector, period: float, phase: float = 0.0) -> Waves:
+def stripes(first: Rgb, second: Rgb, across: Vector, period: float, phase: float = 0.0) -> Waves:
     """Return a texture of soft bands that repeat every ``period`` metres in the direction ``across``."""
     length = math.hypot(*across)
     x, y, z = (2 * math.pi / period * a / length for a in across)
     return Waves(first, second, ((x, y, z),), (phase,), hardness=4.0)
 
 
-def blotches(first: Colour, second: Colour, period: float, seed: int) -> Waves:
+def blotches(first: Rgb, second: Rgb, period: float, seed: int) -> Waves:
     """Return a texture of spots about half a ``period`` (metres) wide, which do not visibly repeat."""
     generator = torch.Generator().manual_seed(seed)
     directions = torch.nn.functional.normalize(torch.randn((7, 3), generator=generator), dim=-1)

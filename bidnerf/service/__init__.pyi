@@ -4,7 +4,7 @@ from .models import LONGEST_NAME as LONGEST_NAME
 from .models import Refused as Refused
 from .models import Upload as Upload
 from .models import validate as validate
-from .protocols import PROTOCOLS as PROTOCOLS
+from .protocols import SERVICES as SERVICES
 from .protocols import ServiceProtocol as ServiceProtocol
 from .queue import RequestQueue as RequestQueue
 from .queue import ThreadExecutor as ThreadExecutor

@@ -17,9 +17,9 @@ from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.types import Scope
 
-from bidnerf.service.models import Localization, MapFacts, Refused
+from bidnerf.service.models import LocalizationBody, MapFacts, Refused
 from bidnerf.service.pool import Pool
-from bidnerf.service.protocols import PROTOCOLS, ServiceProtocol
+from bidnerf.service.protocols import SERVICES, ServiceProtocol
 from bidnerf.service.settings import ServiceLimits
 from bidnerf.service.web import (
     OPEN,
@@ -111,14 +111,14 @@ def application(order: dict[str, Any], limits: ServiceLimits, token: str | None)
         app.post(
             f"{prefix}/localize",
             openapi_extra=photo_request(*["map"] if prefix else []),
-            response_model=Localization,
+            response_model=LocalizationBody,
             responses=FAILURES,
             dependencies=of_map,
             summary="Find the pose of a photo.",
             description="The response is that of 'bidnerf localize --json', in several maps if none is named. Never use a pose whose\n"
             "'converged' is false. Each field is given once, in the query or in the form; at most one of focal, hfov and camera.",
         )(localize)
-        for name, protocol in PROTOCOLS.items():
+        for name, protocol in SERVICES.items():
             _add_protocol(app, f"{prefix}/{name}", name, protocol, of_map)
     return app
 

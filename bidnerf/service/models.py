@@ -24,9 +24,9 @@ from bidnerf_core.settings import LARGEST_SEED
 
 LONGEST_NAME = 200
 """Maximum number of characters of a name in an answer."""
-WIDEST = 170.0
+WIDEST_HFOV = 170.0
 """Largest horizontal field of view (degrees): beyond it, the inner half of the angles fills less than 1/12 of a pinhole image."""
-CAMERAS = ("focal", "hfov", "camera")
+CAMERA_FIELDS = ("focal", "hfov", "camera")
 """The parameters with which a request can state the camera of its photo."""
 ABSENT: Any = None
 """The default of values that may be left out but must not be null."""
@@ -90,7 +90,7 @@ class PhotoForm(BaseModel):
     map: str = Field(ABSENT, description="by default the one that the photo shows")
     name: str = Field(ABSENT, min_length=1, max_length=LONGEST_NAME, description="the frame's name in the answer")
     focal: Number = Field(ABSENT, ge=1e-3, le=1e9, description="focal length in pixels of the stored image")
-    hfov: Number = Field(ABSENT, ge=1e-3, le=WIDEST, description="horizontal field of view in degrees")
+    hfov: Number = Field(ABSENT, ge=1e-3, le=WIDEST_HFOV, description="horizontal field of view in degrees")
     depth_unit: Number = Field(ABSENT, ge=1e-9, le=1e9, description="metres per step of the depth image")
     seed: Annotated[int, BeforeValidator(_require_decimal)] = Field(
         ABSENT, ge=0, le=LARGEST_SEED, description="seed of every random choice"
@@ -105,15 +105,15 @@ class PhotoForm(BaseModel):
 
     @model_validator(mode="after")
     def _has_one_camera(self) -> PhotoForm:
-        given = [name for name in CAMERAS if name in self.model_fields_set]
+        given = [name for name in CAMERA_FIELDS if name in self.model_fields_set]
         if len(given) > 1:
             raise PydanticCustomError(
-                "cameras", f"{' and '.join(given)} are given, expected one of {', '.join(CAMERAS)}"
+                "cameras", f"{' and '.join(given)} are given, expected one of {', '.join(CAMERA_FIELDS)}"
             )
         return self
 
 
-EXPECTED = {
+EXPECTED_VALUES = {
     "greater_than_equal": "a number from {ge:g} up",
     "less_than_equal": "a number up to {le:g}",
     "float_type": "a number",
@@ -151,7 +151,7 @@ def validate(model: type[Model], values: Any) -> Model:
     if kind == "missing":
         raise InputError(f"no {name!r}", expected="all that the description requires")
     text = first["msg"].removeprefix("Value error, ")
-    text = EXPECTED[kind].format(**first.get("ctx", {})) if kind in EXPECTED else text
+    text = EXPECTED_VALUES[kind].format(**first.get("ctx", {})) if kind in EXPECTED_VALUES else text
     if kind == "cameras":  # concerns several fields, which the message names
         raise InputError(text)
     raise InputError(f"{name or 'the body'} is {abbreviate(first['input'])}", expected=text)
@@ -166,13 +166,13 @@ def abbreviate(value: Any) -> str:
 # Responses. These models describe what is sent, but are not used to build it.
 
 
-class Problem(BaseModel):
+class ErrorBody(BaseModel):
     """An error (RFC 9457)."""
 
     title: str
     status: int
     detail: str
-    localization: Localization = Field(ABSENT)
+    localization: LocalizationBody = Field(ABSENT)
 
 
 class MapFacts(BaseModel):
@@ -194,10 +194,10 @@ Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
 Row6 = Annotated[list[float], Field(min_length=6, max_length=6)]
 
 
-class Localization(BaseModel):
+class LocalizationBody(BaseModel):
     """The pose of a photo, and whether it can be trusted: the JSON of 'bidnerf localize'."""
 
-    model_config = ConfigDict(json_schema_extra=_drop_null_defaults)
+    model_config = ConfigDict(title="Localization", json_schema_extra=_drop_null_defaults)
 
     frame: str
     T_world_camera: Annotated[list[Row4], Field(min_length=4, max_length=4, description="camera to world")]
@@ -222,4 +222,4 @@ class Localization(BaseModel):
     runner_up: dict[str, Any] | None = Field(ABSENT, description="the second best of several maps")
 
 
-Problem.model_rebuild()
+ErrorBody.model_rebuild()

@@ -50,7 +50,7 @@ class ServiceProtocol(Protocol):
         """
 
 
-PROTOCOLS: Plugins[ServiceProtocol] = Plugins(
+SERVICES: Plugins[ServiceProtocol] = Plugins(
     "services",
     partial(
         interface_defects,

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 from bidnerf.results import read_pose
-from bidnerf.service.models import WIDEST, Upload
+from bidnerf.service.models import WIDEST_HFOV, Upload
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets import DatasetOptions, Photos
 from bidnerf_core.errors import InputError, spelled
@@ -42,11 +42,11 @@ def read_upload(upload: Upload, usual: CameraSource, folder: Path, max_pixels: f
             texts[name] = folder / name
             texts[name].write_text(upload.parameters[name], encoding="utf-8")
     focal, hfov = upload.parameters.get("focal"), upload.parameters.get("hfov")
-    least = widths.get("photo", 0) / 2 / math.tan(math.radians(WIDEST / 2))
+    least = widths.get("photo", 0) / 2 / math.tan(math.radians(WIDEST_HFOV / 2))
     if focal is not None and focal < least:
         raise InputError(
             f"focal is {focal:g} for {widths['photo']} columns",
-            expected=f"at least {least:.3g}, which is a field of view of {WIDEST:g} degrees",
+            expected=f"at least {least:.3g}, which is a field of view of {WIDEST_HFOV:g} degrees",
         )
     own = CameraSource(texts.get("camera"), focal, hfov, usual.assumed)
     photo, depth = images["photo"], images.get("depth")

@@ -28,8 +28,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from bidnerf.service.models import (
     LONGEST_NAME,
+    ErrorBody,
     PhotoForm,
-    Problem,
     Refused,
     Upload,
     abbreviate,
@@ -126,7 +126,7 @@ class Application(FastAPI):
         schemas = api.setdefault("components", {}).setdefault("schemas", {})
         for unused in ("HTTPValidationError", "ValidationError"):
             schemas.pop(unused, None)
-        schemas["Problem"] = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
+        schemas["Problem"] = ErrorBody.model_json_schema(ref_template="#/components/schemas/{model}")
         schemas |= schemas["Problem"].pop("$defs", {})
         for operation in (each for operations in api["paths"].values() for each in operations.values()):
             for body in operation.get("requestBody", {"content": {}})["content"].values():

@@ -24,7 +24,7 @@ from pydantic import BaseModel
 from bidnerf.results import Answer
 from bidnerf.results import localize as localize_photos
 from bidnerf.service.models import MapFacts, Refused, Upload, validate
-from bidnerf.service.protocols import PROTOCOLS
+from bidnerf.service.protocols import SERVICES
 from bidnerf.service.upload import public_message, read_upload
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.errors import InputError, InputWarning
@@ -70,8 +70,8 @@ class LoadedMaps:
             if (protocol := task.get("protocol")) is None:
                 _, body = localize(task["upload"])
             else:
-                given = _validated(PROTOCOLS[protocol].request, task["body"])
-                body = PROTOCOLS[protocol].answer(given, _scene(self.localizers[task["map"]]), localize)
+                given = _validated(SERVICES[protocol].request, task["body"])
+                body = SERVICES[protocol].answer(given, _scene(self.localizers[task["map"]]), localize)
             reply: dict[str, Any] = {"status": 200, "body": body}
         except Refused as error:
             reply = {"status": error.status, "detail": error.detail, "more": error.more}

@@ -34,9 +34,9 @@ from bidnerf_core.io import read_header, read_image
 from bidnerf_core.mapping import Keypoints, Sift, Vocabulary
 from bidnerf_core.progress import counter
 
-LARGEST = 1600
+MATCHED_SIDE = 1600
 """Longer side of downscaled photos (pixels). Larger ones give slightly more accurate poses, but take far longer."""
-DETECTOR = Sift(count=4096, largest=LARGEST)
+DETECTOR = Sift(count=4096, largest=MATCHED_SIDE)
 LEAST_PHOTOS = 3
 """Smallest number of photos in a model: two photos have a single baseline, which allows no check."""
 NEIGHBOURS = 10
@@ -113,7 +113,7 @@ def list_photos(images: Sequence[SourceImage], given: Camera | CameraSource | st
             continue
         size = (header.width, header.height)
         camera = numbers.setdefault((size, replace(exif, orientation=UPRIGHT)), len(numbers) + 1)
-        photo = ListedPhoto(image, number, size, reduced_size(*size, LARGEST), exif, camera)
+        photo = ListedPhoto(image, number, size, reduced_size(*size, MATCHED_SIDE), exif, camera)
         listed.photos.append(photo)
         if camera not in listed.cameras:
             first, listed.known_focal[camera] = _initial_camera(photo, given)

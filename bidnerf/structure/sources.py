@@ -31,7 +31,7 @@ from bidnerf_core.io import open_binary
 from bidnerf_core.progress import counter
 from bidnerf_core.training import sharpness
 
-STEP = 0.04
+FRAME_STEP = 0.04
 """Image motion between chosen frames, as a fraction of the image diagonal."""
 MOST = 400
 """Largest number of chosen frames; in long videos, the steps are longer."""
@@ -106,7 +106,7 @@ def measure_frames(video: Path) -> list[Measure]:
         grey = whole if size == whole.shape[::-1] else cv2.resize(whole, size, interpolation=cv2.INTER_AREA)
         is_anchor = not len(points)
         if before is not None and is_anchor:  # nothing to track: unknown motion, assumed to be one step
-            motion += STEP
+            motion += FRAME_STEP
         elif before is not None:
             moved, status, _ = cv2.calcOpticalFlowPyrLK(before, grey, points, np.empty_like(points))
             ok = status.reshape(-1) == 1
@@ -129,7 +129,7 @@ def measure_frames(video: Path) -> list[Measure]:
 def choose_frames(frames: Sequence[Measure]) -> list[int]:
     """Return the indices of the frames whose poses are searched: at each step of motion, the sharpest one near it."""
     motion, sharp = np.array(frames).T
-    step = max(STEP, float(motion[-1]) / (MOST - 1))
+    step = max(FRAME_STEP, float(motion[-1]) / (MOST - 1))
     chosen = set[int]()
     for target in np.arange(round(float(motion[-1]) / step) + 1) * step:
         away = np.abs(motion - target)

@@ -26,7 +26,7 @@ from .scene import points as points
 from .scene import rgb_views as rgb_views
 from .scene import rgbd_views as rgbd_views
 from .textured_field import BOUNDS as BOUNDS
-from .textured_field import CAMERA as CAMERA
+from .textured_field import GROUND_CAMERA as GROUND_CAMERA
 from .textured_field import POSES as POSES
 from .textured_field import MapWithLandmarks as MapWithLandmarks
 from .textured_field import TexturedGround as TexturedGround

@@ -23,7 +23,7 @@ from bidnerf.testing.faults import (
     require,
 )
 from bidnerf.testing.textured_field import (
-    CAMERA,
+    GROUND_CAMERA,
     POSES,
     T_MOVED_WORLD,
     MapWithLandmarks,
@@ -125,7 +125,7 @@ class MethodContract(Named):
 
     def test_image_of_another_scene_is_rejected(self) -> None:
         scene = textured_map(surface=True)
-        found = self._localize(scene, seen(POSES[1], CAMERA, "other", seed=1).frame, POSES[1])
+        found = self._localize(scene, seen(POSES[1], GROUND_CAMERA, "other", seed=1).frame, POSES[1])
         require(
             self._who,
             (
@@ -162,7 +162,7 @@ def _difference(found: SE3, truth: SE3) -> float:
 
 # Keypoint detectors.
 
-SHIFT = 6
+PIXEL_SHIFT = 6
 """Pixels by which an image is shifted."""
 
 
@@ -234,11 +234,14 @@ class FeaturesContract(Named):
 
     def test_keypoints_move_with_the_image(self) -> None:
         image = _images()[0]
-        first, second = self._detect(image[:-SHIFT, :-SHIFT]), self._detect(image[SHIFT:, SHIFT:])
+        first, second = (
+            self._detect(image[:-PIXEL_SHIFT, :-PIXEL_SHIFT]),
+            self._detect(image[PIXEL_SHIFT:, PIXEL_SHIFT:]),
+        )
         require(self._who, (len(second.pixels) > 0, "no keypoint in a shifted image"))
-        moved = first.pixels - SHIFT
-        height, width = image.shape[0] - SHIFT, image.shape[1] - SHIFT
-        shared = ((moved > 0) & (moved < torch.tensor([width - SHIFT, height - SHIFT]))).all(1)
+        moved = first.pixels - PIXEL_SHIFT
+        height, width = image.shape[0] - PIXEL_SHIFT, image.shape[1] - PIXEL_SHIFT
+        shared = ((moved > 0) & (moved < torch.tensor([width - PIXEL_SHIFT, height - PIXEL_SHIFT]))).all(1)
         nearest = squared_distances(first.descriptors, second.descriptors).argmin(1)
         off = torch.linalg.vector_norm(second.pixels[nearest] - moved, dim=-1)
         # Keypoints at most 1.5 pixels apart count as the same.
@@ -247,7 +250,7 @@ class FeaturesContract(Named):
             self._who,
             (
                 share >= self.repeated,
-                f"of the keypoints, {share:.0%} are recognised in the image shifted by {SHIFT} pixels, expected"
+                f"of the keypoints, {share:.0%} are recognised in the image shifted by {PIXEL_SHIFT} pixels, expected"
                 f" {self.repeated:.0%} or more; is the centre of the first pixel at (0.5, 0.5)?",
             ),
         )

@@ -16,7 +16,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import POSERS, DatasetOptions
 from bidnerf_core.geometry import SE3, fit_similarity
 
-CAMERA = Intrinsics(260.0, 260.0, 128.0, 96.0, 256, 192)
+PHOTO_CAMERA = Intrinsics(260.0, 260.0, 128.0, 96.0, 256, 192)
 
 
 class PoserContract(Named):
@@ -41,10 +41,10 @@ class PoserContract(Named):
             photos, out = Path(folder) / "photos", Path(folder) / "poses"
             photos.mkdir()
             for name, T in truth.items():
-                pixels = (photograph(T, CAMERA) * 255).round().to(torch.uint8)
+                pixels = (photograph(T, PHOTO_CAMERA) * 255).round().to(torch.uint8)
                 Image.fromarray(pixels.numpy()).save(photos / f"{name}.png")
             with calling(f"{self._who} of {len(truth)} photos"):
-                record = self._part(POSERS.load)(photos, out, CAMERA)
+                record = self._part(POSERS.load)(photos, out, PHOTO_CAMERA)
             with calling(f"reading the dataset of {self._who}"):
                 views = DatasetOptions().open(out).views("all")
         names = [view.frame.name for view in views]
@@ -53,7 +53,7 @@ class PoserContract(Named):
             (record.placed == len(names), f"placed is {record.placed}, expected {len(names)}, the photos with a pose"),
             (len(names) > 2 and set(names) <= set(truth), f"found poses of {names}, expected those of {list(truth)}"),
             (
-                all(view.frame.intrinsics == CAMERA for view in views),
+                all(view.frame.intrinsics == PHOTO_CAMERA for view in views),
                 "the dataset has another camera, expected the one that was given",
             ),
         )

@@ -17,7 +17,7 @@ from bidnerf_core.fields import Rays, widen
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 
-CAMERA = Intrinsics(32.0, 32.0, 12.0, 12.0, 24, 24)
+FIELD_CAMERA = Intrinsics(32.0, 32.0, 12.0, 12.0, 24, 24)
 SCENE_BOUNDS = demo_object().bounds
 SIDE = max(SCENE_BOUNDS.size)  # metres
 DIMMED = 0.6
@@ -32,7 +32,7 @@ def rgbd_views(coverage: bool = True) -> tuple[View, ...]:
     With ``coverage``, the views have an alpha channel; otherwise, they show the toy in front of white, as a
     sensor would see it.
     """
-    seen = seen_from(demo_object(), CAMERA, orbit(3.5, 6))
+    seen = seen_from(demo_object(), FIELD_CAMERA, orbit(3.5, 6))
     return tuple(v if coverage else replace(v, frame=v.frame.replace(alpha=None)) for v in seen)
 
 
@@ -52,7 +52,7 @@ def exposed_views(log_gain: float) -> tuple[View, ...]:
 
 def camera_rays(T_world_camera: SE3) -> Rays:
     """Return the rays through all pixels from a pose, in its precision and differentiable with respect to it."""
-    pixels = CAMERA.unproject(CAMERA.pixel_centres()).reshape(-1, 3).to(T_world_camera.translation)
+    pixels = FIELD_CAMERA.unproject(FIELD_CAMERA.pixel_centres()).reshape(-1, 3).to(T_world_camera.translation)
     directions = T_world_camera.rotate(torch.nn.functional.normalize(pixels, dim=-1))
     return SCENE_BOUNDS.rays(T_world_camera.translation.expand_as(directions), directions)
 

@@ -17,7 +17,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import BakeConfig, LandmarkMap, SurfaceMap, bake, build_landmarks
 
 BOUNDS = SceneBounds((-1.2, -1.2, -0.3), (1.2, 1.2, 0.3), 0.1, 6.0)
-CAMERA = Intrinsics(130.0, 130.0, 64.0, 48.0, 128, 96)
+GROUND_CAMERA = Intrinsics(130.0, 130.0, 64.0, 48.0, 128, 96)
 POSES = orbit(1.7, 3, elevation=(50.0, 70.0), seed=5)
 """Poses (T_world_camera) that no training image has."""
 
@@ -68,7 +68,7 @@ def ground(seed: int = 0) -> TexturedGround:
 
 def textured_view(T: SE3, name: str = "", seed: int = 0) -> View:
     """Return an image of the ground with its depth."""
-    return seen(T, CAMERA, name, seed)
+    return seen(T, GROUND_CAMERA, name, seed)
 
 
 def seen(T: SE3, camera: Intrinsics, name: str = "", seed: int = 0) -> View:

@@ -5,6 +5,6 @@ from .pages import row_json as row_json
 from .pages import view as view
 from .scene import map_json as map_json
 from .scene import trajectory_json as trajectory_json
-from .server import PORT as PORT
+from .server import VIEWER_PORT as VIEWER_PORT
 from .server import require_viewer as require_viewer
 from .server import serve_view as serve_view

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bidnerf.results import landmark_matches, pose_error
 from bidnerf.viewer.evidence import HERE, acceptance_figures, contests, last_answer, name_earlier, probable_poses
-from bidnerf.viewer.pictures import Json, jpeg_json, pack, png_json, quick_image
+from bidnerf.viewer.pictures import JsonObject, jpeg_json, pack, png_json, quick_image
 from bidnerf.viewer.scene import frustum, matrix_rows
 from bidnerf_core.fields import RenderedImage, has_field, render_picture
 from bidnerf_core.frames import Frame
@@ -38,7 +38,7 @@ MOST_STEPS = 200
 """Maximum number of steps of a descent that are shown; longer descents are subsampled at a regular stride."""
 
 
-NO_ANSWER: Json = {
+NO_ANSWER: JsonObject = {
     "name": "",
     "outcome": "",
     "accepted": False,
@@ -70,7 +70,7 @@ NO_ANSWER: Json = {
 """All JSON values of an answer, see ``answer_json``, with their values for an image of which nothing is known."""
 
 
-def no_answer(name: str, outcome: str, reason: str) -> Json:
+def no_answer(name: str, outcome: str, reason: str) -> JsonObject:
     """Return the JSON values for an image that could not be localized, in the format of ``answer_json``."""
     return NO_ANSWER | {"name": name, "outcome": outcome, "reason": reason}
 
@@ -82,7 +82,7 @@ def answer_json(
     frame: Frame | None = None,
     record: SearchRecord | None = None,
     truth: SE3 | None = None,
-) -> Json:
+) -> JsonObject:
     """Return the JSON values of a localization, without the renderings that ``add_renderings`` adds.
 
     ``frame`` is the image that was localized, if it is known, ``record`` is the record of the search, and ``truth`` the
@@ -143,15 +143,15 @@ def answer_json(
 
 
 def add_renderings(
-    answer: Json, scene: SceneMap, localization: Localization, frame: Frame, quick: bool = False
-) -> Json:
+    answer: JsonObject, scene: SceneMap, localization: Localization, frame: Frame, quick: bool = False
+) -> JsonObject:
     """Return the JSON values of a localization together with renderings from its pose and from that of the runner-up.
 
     ``frame`` is the image that was localized. ``quick`` renderings show the surface instead of the field.
     """
     frame = localization.frame_as_taken(frame)
 
-    def render(pose: tuple[float, ...], most: int) -> tuple[Json, Json | None]:
+    def render(pose: tuple[float, ...], most: int) -> tuple[JsonObject, JsonObject | None]:
         camera, rows = frame.intrinsics.at_most(most), torch.tensor(pose, dtype=torch.float64).reshape(4, 4)
         T = SE3(rows[:3, :3], rows[:3, 3])
         if quick or not has_field(scene.field):
@@ -168,7 +168,7 @@ def add_renderings(
     return answer | {"rendered": rendered, "depth": depth}
 
 
-def ellipsoid(T_world_camera: SE3, covariance: Float[Tensor, "6 6"] | None) -> Json | None:
+def ellipsoid(T_world_camera: SE3, covariance: Float[Tensor, "6 6"] | None) -> JsonObject | None:
     """Return the two-sigma ellipsoid of a pose's position, or None if the covariance is unknown or not finite.
 
     ``covariance`` is that of a right update of the pose (translation, then rotation in radians). In the result,
@@ -188,7 +188,7 @@ def ellipsoid(T_world_camera: SE3, covariance: Float[Tensor, "6 6"] | None) -> J
     }
 
 
-def depth_difference(image: RenderedImage, frame: Frame) -> Json | None:
+def depth_difference(image: RenderedImage, frame: Frame) -> JsonObject | None:
     """Return the rendered minus the measured depth as a colour image, or None if no pixel has both.
 
     ``range`` is the difference at the ends of the colour scale, and ``median`` is the median absolute difference,
@@ -215,7 +215,7 @@ def depth_difference(image: RenderedImage, frame: Frame) -> Json | None:
     return {"picture": picture, "range": most, "median": float(difference.abs().median())}
 
 
-def _steps(localization: Localization, record: SearchRecord | None) -> tuple[Json, ...]:
+def _steps(localization: Localization, record: SearchRecord | None) -> tuple[JsonObject, ...]:
     """Return the steps of the search (or else of the descent), then the pose together with its rivals, then the pose found."""
     last = localization.T_world_camera.to("cpu", torch.float64)
     shown = [] if record is None else [_step(s.caption, s.T, s.scores.tolist(), s.passing) for s in record.steps]
@@ -236,7 +236,7 @@ def _steps(localization: Localization, record: SearchRecord | None) -> tuple[Jso
     return (*shown, _step(HERE, last[None], [0.0], 1, shown[-1]["loss"] if shown else None))
 
 
-def _step(caption: str, T: SE3, scores: list[float], retained: int, loss: float | None = None) -> Json:
+def _step(caption: str, T: SE3, scores: list[float], retained: int, loss: float | None = None) -> JsonObject:
     """Return one step: the poses that were considered together, the best first, their scores, how many were retained, and the ``loss`` of a descent."""
     poses = pack(T.matrix()[:, :3].detach().cpu().double().flatten(1).numpy())
     known = tuple(map(_finite, scores))
@@ -247,7 +247,7 @@ def _finite(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
 
 
-def _matches(scene: SceneMap, localization: Localization, answer: LandmarkAnswer) -> Json | None:
+def _matches(scene: SceneMap, localization: Localization, answer: LandmarkAnswer) -> JsonObject | None:
     """Return the last image's matches at the last pose from landmarks: matches by projection, then further ones by descriptor.
 
     ``keypoints`` and the ``projections`` of their landmarks (NaN behind the camera) are fractions of the image size,
@@ -279,7 +279,7 @@ def _matches(scene: SceneMap, localization: Localization, answer: LandmarkAnswer
     }
 
 
-def _runner_up(scene: SceneMap, localization: Localization, record: SearchRecord) -> Json | None:
+def _runner_up(scene: SceneMap, localization: Localization, record: SearchRecord) -> JsonObject | None:
     """Return a rival pose: an earlier one from landmarks, else the next most probable one, else the best other one searched."""
     if answer := last_answer(record):
         if given_up := name_earlier(localization, answer):
@@ -296,5 +296,5 @@ def _runner_up(scene: SceneMap, localization: Localization, record: SearchRecord
     return None
 
 
-def _other_pose(reason: str, T: SE3, probability: float | None = None) -> Json:
+def _other_pose(reason: str, T: SE3, probability: float | None = None) -> JsonObject:
     return {"reason": reason, "pose": matrix_rows(T), "rendered": None, "probability": probability}

@@ -39,7 +39,7 @@ from bidnerf.service import (
 )
 from bidnerf.viewer.answer import no_answer
 from bidnerf.viewer.pages import MapView, answer_query, require_map
-from bidnerf.viewer.pictures import Json, field_image, jpeg, quick_image
+from bidnerf.viewer.pictures import JsonObject, field_image, jpeg, quick_image
 from bidnerf.viewer.scene import map_json, thumbnail
 from bidnerf_core.camera import CameraSource, Intrinsics
 from bidnerf_core.datasets import Query, QuerySource
@@ -68,8 +68,8 @@ class LiveView:
 
     localizer: Localizer
     source: QuerySource | None = None
-    trajectory: Json | None = None
-    results: tuple[Json, ...] = ()
+    trajectory: JsonObject | None = None
+    results: tuple[JsonObject, ...] = ()
     camera: CameraSource | None = None
 
 
@@ -85,7 +85,7 @@ class ShownJob:
     name: str
     state: Literal["waiting", "searching", "rendering", "done"] = "waiting"
     record: SearchRecord | None = None
-    answer: Json | None = None
+    answer: JsonObject | None = None
     task: asyncio.Task[None] = field(init=False)
 
     def plain(self, known: str) -> dict[str, Any]:
@@ -110,7 +110,7 @@ class ShownJob:
         finally:
             self.state = "done"
 
-    def _follow(self, record: SearchRecord, answer: Json | None) -> None:
+    def _follow(self, record: SearchRecord, answer: JsonObject | None) -> None:
         self.record, self.answer, self.state = record, answer, "rendering" if answer else "searching"
 
 

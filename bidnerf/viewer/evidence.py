@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from bidnerf.results import is_pose_of
-from bidnerf.viewer.pictures import Json
+from bidnerf.viewer.pictures import JsonObject
 from bidnerf.viewer.scene import matrix_rows
 from bidnerf_core.geometry import SE3, symbol
 from bidnerf_core.localization import (
@@ -33,9 +33,9 @@ def last_answer(record: SearchRecord | None) -> LandmarkAnswer | None:
     return None if record is None or not record.answers else record.answers[-1]
 
 
-def contests(localization: Localization, record: SearchRecord | None) -> tuple[Json, ...]:
+def contests(localization: Localization, record: SearchRecord | None) -> tuple[JsonObject, ...]:
     """Return up to three comparisons: between poses by landmarks, of the pose with other explanations, and between cameras."""
-    shown, answer, support = list[Json](), last_answer(record), localization.diagnostics
+    shown, answer, support = list[JsonObject](), last_answer(record), localization.diagnostics
     if answer is not None and len(answer.modes) > 1:
         shown.append(_compare_modes(localization, answer))
     if isinstance(support, Support) and "displaced" in support.measures:
@@ -64,13 +64,13 @@ def _contest(
     answers: Iterable[tuple[str, float] | tuple[str, float, Sequence[float] | None]],
     note: str = "",
     of_pose: bool = True,
-) -> Json:
+) -> JsonObject:
     """Return a comparison of poses or cameras: names, probabilities and, for other poses, the 16 numbers of T_world_camera."""
     shown = [{"pose": None} | dict(zip(("name", "probability", "pose"), each, strict=False)) for each in answers]
     return {"question": question, "answers": shown, "note": note, "of_pose": of_pose}
 
 
-def _compare_modes(localization: Localization, answer: LandmarkAnswer) -> Json:
+def _compare_modes(localization: Localization, answer: LandmarkAnswer) -> JsonObject:
     shown, here, best = [], answer.T_world_rig.to("cpu"), answer.posterior.mode
     for mode, T, probability in probable_poses(answer):
         distance = float((T.translation - here.translation).norm())
@@ -84,7 +84,7 @@ def _compare_modes(localization: Localization, answer: LandmarkAnswer) -> Json:
     return _contest("This pose, another, or the mirror image?" if len(others) > 1 else question, shown)
 
 
-def _compare_cameras(localization: Localization, answer: LandmarkAnswer) -> Json:
+def _compare_cameras(localization: Localization, answer: LandmarkAnswer) -> JsonObject:
     posterior, names = answer.posterior, answer.explanations.names
     own = posterior.probability * (posterior.states.mode == posterior.mode)
     shown = dict[str, float]()
@@ -98,7 +98,7 @@ def _compare_cameras(localization: Localization, answer: LandmarkAnswer) -> Json
     return _contest("Whose camera took it?", likely, f"Weighed at {pose}." if pose else "", of_pose=False)
 
 
-def _compare_rivals(support: Support) -> Json:
+def _compare_rivals(support: Support) -> JsonObject:
     names = {
         "displaced": f"the pose moved by {DISPLACEMENT:.0%} of its distance to the scene",
         "other": "another pose of the search",
@@ -205,7 +205,7 @@ WITHOUT_LANDMARKS = {
 """Label, format and meaning of each measure of a pose that landmarks did not find."""
 
 
-def bar(value: float, threshold: float, at_least: bool) -> Json | None:
+def bar(value: float, threshold: float, at_least: bool) -> JsonObject | None:
     """Return the position of a value on a linear scale from 0 to 1, on which the threshold is at 0.5 and values are clamped to 1.
 
     If ``at_least`` is set, values below the threshold fail; otherwise, values above the threshold fail. Returns None
@@ -224,7 +224,7 @@ class EvidenceFigure:
     value: str
     threshold: str  # with "at least" or "at most"; empty for a measure without one
     passed: bool | None  # None if there is no threshold
-    bar: Json | None
+    bar: JsonObject | None
     meaning: str
     pose: str = ""  # description of the measured pose, if it is not the pose found
 

@@ -17,7 +17,7 @@ from typing import Any
 
 from bidnerf.results import BAD_INPUT
 from bidnerf.viewer.answer import add_renderings, answer_json, no_answer
-from bidnerf.viewer.pictures import Json
+from bidnerf.viewer.pictures import JsonObject
 from bidnerf.viewer.scene import map_json, trajectory_json
 from bidnerf_core.datasets import Query, QuerySource
 from bidnerf_core.errors import InputError, amount
@@ -35,13 +35,13 @@ MODULES = ("data", "space", "compare", "panel", "table", "track", "live", "main"
 class MapView:
     """A page that shows a map and localizations in it; a notebook displays the page, and ``save`` writes it to a file."""
 
-    map: Json
-    answers: tuple[Json, ...] = ()
+    map: JsonObject
+    answers: tuple[JsonObject, ...] = ()
     title: str = ""
     live: bool = False  # whether a server answers
     queries: tuple[str, ...] = ()  # names of images that the server can localize
-    trajectory: Json | None = None
-    results: tuple[Json, ...] = ()
+    trajectory: JsonObject | None = None
+    results: tuple[JsonObject, ...] = ()
     hfov: float | None = None  # horizontal field of view (degrees) that the page's input field shows at first
     # whether photos without a field of view have a given camera, rather than that of EXIF or the map
     camera_given: bool = False
@@ -119,7 +119,7 @@ def view(
     neither a map nor a localizer, and for a frame that cannot be localized at all.
     """
     scene_map = require_map(scene)
-    answers = list[Json]()
+    answers = list[JsonObject]()
     if localization is not None:
         name = "localization" if frame is None else frame.name
         answer = answer_json(scene_map, name, localization, frame)
@@ -144,8 +144,8 @@ def answer_query(
     query: Query,
     start: SE3 | None = None,
     seed: int = 0,
-    follow: Callable[[SearchRecord, Json | None], None] | None = None,
-) -> Json:
+    follow: Callable[[SearchRecord, JsonObject | None], None] | None = None,
+) -> JsonObject:
     """Localize a query, and return the page's JSON values of the answer and its search. Raises ``InputError`` if it cannot be used.
 
     ``follow`` is called twice: before the search with its record, and before the field is rendered with the record
@@ -162,7 +162,7 @@ def answer_query(
     return add_renderings(answer, scene, localization, frame)
 
 
-def answer_image(localizer: Localizer, source: QuerySource, index: int) -> Json:
+def answer_image(localizer: Localizer, source: QuerySource, index: int) -> JsonObject:
     """Localize the query at an index of a source; if the query cannot be used, the answer states why."""
     try:
         return answer_query(localizer, source.read(index))
@@ -170,7 +170,7 @@ def answer_image(localizer: Localizer, source: QuerySource, index: int) -> Json:
         return no_answer(source.names[index], BAD_INPUT, str(error))
 
 
-def row_json(row: Any) -> Json:
+def row_json(row: Any) -> JsonObject:
     """Return the JSON values of a row in the page's table, from a result of an evaluation.
 
     In ``row``, the pose and the covariance are lists of matrix rows. In the result, ``error`` holds the position

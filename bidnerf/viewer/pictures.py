@@ -20,11 +20,11 @@ from bidnerf_core.fields import has_field, render_image
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import SceneMap, picture_at, surface_renderer
 
-Json: TypeAlias = dict[str, Any]
+JsonObject: TypeAlias = dict[str, Any]
 """A part of the page's state, which the page's scripts read. Its entries are described by the function that returns it."""
 
 
-def pack(array: np.ndarray) -> Json:
+def pack(array: np.ndarray) -> JsonObject:
     """Return an array of bytes, 16-bit integers or floats as its ``type``, its ``shape`` and its data in ``base64``."""
     kinds = {"i1": "int8", "u1": "uint8", "u2": "uint16", "f4": "float32", "f8": "float32"}
     kind = kinds[array.dtype.str[1:]]
@@ -32,7 +32,7 @@ def pack(array: np.ndarray) -> Json:
     return {"type": kind, "shape": array.shape, "base64": base64.b64encode(content).decode()}
 
 
-def pack_points(points: Float[Tensor, "n 3"]) -> Json:
+def pack_points(points: Float[Tensor, "n 3"]) -> JsonObject:
     """Return points quantized to 16-bit integers, ``places``: a coordinate is ``lower + value / 65535 * size``."""
     values = points.detach().cpu().double().numpy()
     lower = values.min(0) if len(values) else np.zeros(3)
@@ -41,7 +41,7 @@ def pack_points(points: Float[Tensor, "n 3"]) -> Json:
     return {"lower": lower.tolist(), "size": size, "places": pack(places)}
 
 
-def pack_colours(rgb: Float[Tensor, "n 3"]) -> Json:
+def pack_colours(rgb: Float[Tensor, "n 3"]) -> JsonObject:
     """Return colours in [0, 1], quantized to bytes."""
     return pack((rgb.detach().cpu().float().clamp(0, 1).numpy() * 255 + 0.5).astype(np.uint8))
 
@@ -53,13 +53,13 @@ def jpeg(image: Float[Tensor, "h w 3"] | UInt8[np.ndarray, "h w 3"]) -> bytes:
     return file.getvalue()
 
 
-def jpeg_json(image: Float[Tensor, "h w 3"]) -> Json:
+def jpeg_json(image: Float[Tensor, "h w 3"]) -> JsonObject:
     """Return an image as the data ``url`` of a JPEG, with its ``width`` and ``height`` in pixels."""
     url = "data:image/jpeg;base64," + base64.b64encode(jpeg(image)).decode()
     return {"url": url, "width": int(image.shape[1]), "height": int(image.shape[0])}
 
 
-def png_json(image: UInt8[np.ndarray, "h w channels"]) -> Json:
+def png_json(image: UInt8[np.ndarray, "h w channels"]) -> JsonObject:
     """Return an image, with or without an alpha channel, in the format of ``jpeg_json`` but encoded as PNG."""
     file = io.BytesIO()
     Image.fromarray(image).save(file, "PNG", optimize=True)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from bidnerf.results import pose_entries, standard_deviations
 from bidnerf.viewer.pictures import (
-    Json,
+    JsonObject,
     jpeg_json,
     pack,
     pack_colours,
@@ -39,7 +39,7 @@ MOST_POINTS = 120_000
 """Maximum number of surfels or splats in a page; larger sets are subsampled at random."""
 
 
-def map_json(scene: Map, thumbnails: int = 60) -> Json:
+def map_json(scene: Map, thumbnails: int = 60) -> JsonObject:
     """Return the JSON values of a map; ``thumbnails`` is the maximum number of cameras with a rendered thumbnail.
 
     ``unit`` is the symbol of the unit of length, ``up_source`` states how the upward direction ``up`` was found, and
@@ -71,7 +71,7 @@ def map_json(scene: Map, thumbnails: int = 60) -> Json:
     }
 
 
-def frustum(camera: Intrinsics) -> Json:
+def frustum(camera: Intrinsics) -> JsonObject:
     """Return a camera's viewing frustum without lens distortion: its sides on the plane z = 1, and the image size (pixels)."""
     return {
         "left": -camera.cx / camera.fx,
@@ -114,10 +114,10 @@ def _points(
     points: Float[Tensor, "n 3"],
     count: int,
     radius: float,
-    colours: Json | None = None,
-    sizes: Json | None = None,
-    normals: Json | None = None,
-) -> Json:
+    colours: JsonObject | None = None,
+    sizes: JsonObject | None = None,
+    normals: JsonObject | None = None,
+) -> JsonObject:
     """Return the JSON values of a subset of a map's points; ``count`` is the number of all points.
 
     The radius of each point is ``radius``, in the map's unit, times the point's entry in ``sizes``, float32 (n), if
@@ -133,7 +133,7 @@ def _points(
     }
 
 
-def _surface(scene: Map) -> Json | None:
+def _surface(scene: Map) -> JsonObject | None:
     if scene.surface is None:
         return None
     surfels = scene.surface.surfels
@@ -161,14 +161,14 @@ def turn_towards(
     return torch.where(ahead < 0, -normals, normals)
 
 
-def _landmarks(scene: Map) -> Json | None:
+def _landmarks(scene: Map) -> JsonObject | None:
     if scene.landmarks is None:
         return None
     some = _subset(len(scene.landmarks), 20_000)
     return _points(scene.landmarks.positions[some], len(scene.landmarks), 0.0)
 
 
-def _splats(scene: Map) -> Json | None:
+def _splats(scene: Map) -> JsonObject | None:
     """Return the splats of the field, except nearly transparent ones, as points with their own radii."""
     if not isinstance(scene.field, SplatField):
         return None
@@ -210,7 +210,9 @@ def _framing(scene: Map) -> tuple[tuple[float, float, float], float]:
 # Trajectories.
 
 
-def trajectory_json(path: Path, unit: LengthUnit | None = None, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> Json:
+def trajectory_json(
+    path: Path, unit: LengthUnit | None = None, origin: Sequence[float] = (0.0, 0.0, 0.0)
+) -> JsonObject:
     """Read a trajectory: a JSON file of 'bidnerf track' or 'localize', which has uncertainties, or a TUM, EuRoC or KITTI file.
 
     The poses are shown relative to ``origin``, the origin of the map. A remark is logged if the file states a unit

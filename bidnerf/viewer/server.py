@@ -11,20 +11,22 @@ from bidnerf.service import ServiceLimits, choose_token, require_server, run_app
 if TYPE_CHECKING:
     from bidnerf.viewer.app import LiveView
 
-PORT = 8010
-NEEDS = "the live viewer needs the extra 'viewer' (pip install 'bidnerf[viewer]'); `save` writes a page without it"
+VIEWER_PORT = 8010
+VIEWER_NEEDS = (
+    "the live viewer needs the extra 'viewer' (pip install 'bidnerf[viewer]'); `save` writes a page without it"
+)
 
 
 def require_viewer() -> None:
     """Raise ``InputError`` if the extra ``viewer`` is not installed; callers need not load a map before they know."""
-    require_server(NEEDS)
+    require_server(VIEWER_NEEDS)
 
 
 def serve_view(
     live: LiveView,
     *,
     host: str | None = None,
-    port: int = PORT,
+    port: int = VIEWER_PORT,
     token: str | None = None,
     limits: ServiceLimits | None = None,
     ready: Callable[[str], None] | None = None,

@@ -64,7 +64,7 @@ DISTORTIONS = {
     ),
 }
 """The names of distortion models in calibrations, in lower case, by our kind of model."""
-EXPECTED = "YAML from ROS (camera_info), OpenCV, ORB-SLAM or Kalibr with the intrinsics of one camera"
+EXPECTED_YAML = "YAML from ROS (camera_info), OpenCV, ORB-SLAM or Kalibr with the intrinsics of one camera"
 
 
 @dataclass(frozen=True)
@@ -164,9 +164,9 @@ def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> 
     if start[:1] in (b"{", b"["):
         return _json_camera(parse_record(str(path), content), size)
     if start.startswith((b"%YAML", b"---")) or path.suffix.lower() in (".yaml", ".yml"):
-        values = parse_yaml(content, str(path), EXPECTED)
+        values = parse_yaml(content, str(path), EXPECTED_YAML)
         if not isinstance(values, Mapping):
-            raise InputError(where=path, expected=EXPECTED)
+            raise InputError(where=path, expected=EXPECTED_YAML)
         return parse_calibration(str(path), values, size)
     return _choose(path, _text_cameras(path, content), photo)
 
@@ -261,7 +261,7 @@ def parse_calibration(where: str, values: Mapping[str, Any], size: tuple[int, in
         names = ("k1", "k2", "k3", "k4") if model.lower() in DISTORTIONS[FISHEYE] else ("k1", "k2", "p1", "p2", "k3")
         four, lens = ([values.get(f"{slam}.{x}", 0.0) for x in some] for some in (("fx", "fy", "cx", "cy"), names))
     if given is None and four is None:
-        raise InputError(f"no camera matrix ({', '.join(KEYS['K'][:3])} or K)", where=where, expected=EXPECTED)
+        raise InputError(f"no camera matrix ({', '.join(KEYS['K'][:3])} or K)", where=where, expected=EXPECTED_YAML)
     K = _array(where, four if given is None else given)
     if K.shape == (4,):
         K = np.array(((K[0], 0, K[2]), (0, K[1], K[3]), (0, 0, 1)))

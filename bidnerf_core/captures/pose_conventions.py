@@ -245,7 +245,7 @@ def _of_axes() -> Iterator[Reading]:
 
 
 Part = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-PARTS: tuple[tuple[Part, str, str], ...] = (
+POSE_PARTS: tuple[tuple[Part, str, str], ...] = (
     (
         lambda R, t: (R.mT, t),
         "their rotations are transposed, while their positions are right",
@@ -301,7 +301,7 @@ def _of_parts() -> Iterator[Reading]:
         rotation, position = part(T.rotation, T.translation[..., None])
         return SE3(rotation, position[..., 0])
 
-    for part, clause, remedy in PARTS:
+    for part, clause, remedy in POSE_PARTS:
         yield from _in_file_axes(clause, remedy, partial(understand, part=part))
 
 

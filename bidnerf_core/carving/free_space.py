@@ -24,7 +24,7 @@ from bidnerf_core.fields import VoxelGrid
 from bidnerf_core.frames import Frame, View
 
 CPU = torch.device("cpu")
-BLOCK = 8
+RAY_BLOCK = 8
 """Cells along the side of a block. Processing a block for a view that does not see it costs next to nothing."""
 AROUND = np.ones((3, 3), np.uint8)
 """A pixel and its eight neighbours."""
@@ -157,12 +157,12 @@ def occupied_cells(
 
     Cells are processed in blocks, which may reach beyond the box.
     """
-    counts = [-(-count // BLOCK) for count in shape]
+    counts = [-(-count // RAY_BLOCK) for count in shape]
     first = torch.tensor(lower, dtype=torch.float64)
     size = (torch.tensor(upper, dtype=torch.float64) - first) / torch.tensor(shape)  # of a cell
     radius = torch.linalg.vector_norm(size).item() / 2
-    blocks, cells = _indices(counts), _indices([BLOCK] * 3)
-    votes = torch.zeros(blocks.shape[1], BLOCK**3, dtype=torch.uint8, device=device)
+    blocks, cells = _indices(counts), _indices([RAY_BLOCK] * 3)
+    votes = torch.zeros(blocks.shape[1], RAY_BLOCK**3, dtype=torch.uint8, device=device)
     needed = 1 if len(views) < 2 else 2
     undecided = torch.ones(len(votes), dtype=torch.bool, device=device)
     at_once = 128 if device.type == "cpu" else max(1, len(votes))  # so few blocks stay in the cache
@@ -173,16 +173,16 @@ def occupied_cells(
             T_camera_world = view.T_ref_camera.to(torch.float64).inverse()
             # The middles of the blocks' first cells, and the offsets of a block's cells from them (metres, camera frame)
             step = T_camera_world.rotation * size
-            corner = T_camera_world.apply(first + size / 2)[:, None] + step @ (blocks * BLOCK).double()
+            corner = T_camera_world.apply(first + size / 2)[:, None] + step @ (blocks * RAY_BLOCK).double()
             corners, within = move_to((corner.float(), (step @ cells.double()).float()), device)
-            seen = space.may_free(corners + within.mean(dim=1, keepdim=True), BLOCK * radius)
+            seen = space.may_free(corners + within.mean(dim=1, keepdim=True), RAY_BLOCK * radius)
             for rows in (seen & undecided).nonzero()[:, 0].split(at_once):
                 points = (corners[:, rows, None] + within[:, None, :]).flatten(1)
-                freed = space.frees(points, radius).unflatten(0, (-1, BLOCK**3))
+                freed = space.frees(points, radius).unflatten(0, (-1, RAY_BLOCK**3))
                 votes[rows] = (votes[rows] + freed).clamp(max=needed)  # a byte would overflow with many views
                 undecided[rows] = (votes[rows] < needed).any(dim=1)
-        whole = (votes < needed).reshape(*counts, BLOCK, BLOCK, BLOCK).permute(0, 3, 1, 4, 2, 5)
-        whole = whole.reshape([count * BLOCK for count in counts])
+        whole = (votes < needed).reshape(*counts, RAY_BLOCK, RAY_BLOCK, RAY_BLOCK).permute(0, 3, 1, 4, 2, 5)
+        whole = whole.reshape([count * RAY_BLOCK for count in counts])
         return whole[: shape[0], : shape[1], : shape[2]].contiguous()
 
 

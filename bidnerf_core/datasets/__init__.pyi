@@ -21,6 +21,7 @@ from .formats.colmap import colmap_project as colmap_project
 from .formats.colmap import shot_of as shot_of
 from .formats.transforms_json import read_frames as read_frames
 from .options import AS_STORED as AS_STORED
+from .options import TEST_IMAGES as TEST_IMAGES
 from .options import DatasetOptions as DatasetOptions
 from .options import DepthRegistration as DepthRegistration
 from .pose_rows import camera_of as camera_of

@@ -75,7 +75,7 @@ def read_model(folder: Path) -> tuple[list[ModelImage], ModelPoints]:
             where=folder,
             expected="images.bin and points3D.bin, or the same as .txt, as in sparse/0 of a project",
         )
-    found = sorted((n[0], n[1:4], n[7], len(track)) for _, n, _, track in _entries(points, POINTS))
+    found = sorted((n[0], n[1:4], n[7], len(track)) for _, n, _, track in _entries(points, POINT_RECORDS))
     ids, positions, errors, tracks = zip(*found, strict=True) if found else ((), (), (), ())
     if len(set(ids)) < len(ids):
         raise InputError("two points have the same id", where=points, expected="unique ids")
@@ -99,7 +99,7 @@ def read_posed_images(folder: Path) -> tuple[list[ModelImage], dict[int, Camera]
     if cameras.suffix == ".txt":
         return _images(images), read_text_cameras(cameras)
     found = dict[int, Camera]()
-    for where, (number, model, width, height), _, parameters in _entries(cameras, CAMERAS):
+    for where, (number, model, width, height), _, parameters in _entries(cameras, CAMERA_RECORDS):
         name = next(name for name, (known, _, _) in MODELS.items() if known == model)
         found[number] = colmap_camera(f"{where}: camera {number}", name, width, height, parameters.tolist())
     return _images(images), found
@@ -136,7 +136,7 @@ def read_colmap_depth(path: Path) -> DepthImage:
 
 def _images(file: Path) -> list[ModelImage]:
     images = list[ModelImage]()
-    for where, (_, *pose, camera), name, observed in _entries(file, IMAGES):
+    for where, (_, *pose, camera), name, observed in _entries(file, IMAGE_RECORDS):
         quaternion, translation = pose[:4], pose[4:]
         if not (np.isfinite(pose).all() and 0.5 < np.linalg.norm(quaternion) < 2):
             raise InputError(f"image {name!r} has an invalid pose", where=where, expected="a unit quaternion")
@@ -171,14 +171,16 @@ def _parameters(path: Path, numbers: Sequence[Any]) -> int:
     )
 
 
-CAMERAS = _Columns("IiQQ", np.dtype([("parameter", "<f8")]), "", length=_parameters)
-IMAGES = _Columns(
+CAMERA_RECORDS = _Columns("IiQQ", np.dtype([("parameter", "<f8")]), "", length=_parameters)
+IMAGE_RECORDS = _Columns(
     "IdddddddI",
     np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")]),
     "id, pose, camera and name of an image",
     "x, y, id of points",
 )
-POINTS = _Columns("qdddBBBd", np.dtype([("image", "<u4"), ("keypoint", "<u4")]), "id, x y z, r g b, error and a track")
+POINT_RECORDS = _Columns(
+    "qdddBBBd", np.dtype([("image", "<u4"), ("keypoint", "<u4")]), "id, x y z, r g b, error and a track"
+)
 _Entry: TypeAlias = tuple[str, list[Any], str, np.ndarray]
 """Where an entry is, its numbers, the name of the image, and the last column of its list."""
 

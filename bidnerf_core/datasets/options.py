@@ -148,5 +148,7 @@ class DatasetOptions:
         return register if isinstance(register, DepthCamera) else DepthCamera.read(Path(register))
 
 
+TEST_IMAGES = DatasetOptions(split="test")
+"""The default options for images with which a map is tested."""
 AS_STORED = DatasetOptions()
 """The options for images of split "train" as the dataset stores them."""

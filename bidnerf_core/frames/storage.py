@@ -19,7 +19,7 @@ from torch import Tensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame, as_floats
 
-BLOCK = 2**28
+FILE_BLOCK = 2**28
 """Bytes per block, unless an image is larger. If there are only a few blocks, drawing pixels from all images at once is cheap.
 Images that need more than one block are held in files, whose pages the system may drop when it needs memory."""
 ALIGNMENT = 16
@@ -35,7 +35,7 @@ class PixelStore:
     """
 
     def __init__(self, expected: int, folder: Path | None = None) -> None:
-        self._mapped, self._folder, self._expected = expected > BLOCK, folder, expected
+        self._mapped, self._folder, self._expected = expected > FILE_BLOCK, folder, expected
         self._block, self._used = torch.empty(0, dtype=torch.uint8), 0
 
     def store(self, frame: Frame) -> Frame:
@@ -56,7 +56,7 @@ class PixelStore:
         return self._block[start : start + size].view(image.dtype).view(image.shape).copy_(image)
 
     def _new_block(self, least: int) -> Tensor:
-        size = max(least, min(BLOCK, self._expected + ALIGNMENT))
+        size = max(least, min(FILE_BLOCK, self._expected + ALIGNMENT))
         if not self._mapped:
             return torch.empty(size, dtype=torch.uint8)
         try:

@@ -38,5 +38,5 @@ from .training import TrainOptions as TrainOptions
 from .training import check_resumable as check_resumable
 from .training import resume as resume
 from .training import train as train
-from .views import Images as Images
+from .views import ViewSource as ViewSource
 from .views import read_views as read_views

@@ -45,21 +45,21 @@ from bidnerf_core.maps.description import load_info, longest_side
 from bidnerf_core.maps.map import USUAL_BAKE, Map, load_map
 from bidnerf_core.maps.store import with_tracks_in
 from bidnerf_core.maps.training import TrainOptions, train_field
-from bidnerf_core.maps.views import Images, views_again
+from bidnerf_core.maps.views import ViewSource, views_again
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context, log
 
 NewPhotos: TypeAlias = Sequence[Frame] | Sequence[View] | Capture | str | Path
 """Photos to add: frames, views, a dataset or the path to one, or the path to a photo or a folder of photos.
 Poses that come with them are ignored."""
 
-LeftOut: TypeAlias = tuple[str, str]
+LeftOutPhoto: TypeAlias = tuple[str, str]
 """The name of a photo that was left out, and the reason."""
 
 
 def extend(
     scene: Map | str | Path,
     photos: NewPhotos,
-    data: Images | None = None,
+    data: ViewSource | None = None,
     *,
     split: str = "train",
     steps: int | None = None,
@@ -102,7 +102,7 @@ def extend(
         return _extend(scene, new, _old_views(scene, data, split), data is not None, steps, config)
 
 
-def localize_new(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut]) -> list[View]:
+def localize_new(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOutPhoto]) -> list[View]:
     """Localize frames in a map, and return those that are new to it as views, with names that the map does not use yet.
 
     ``unread`` lists the photos that could not be read; they count as left out. Raises ``InputError`` if the map
@@ -154,10 +154,10 @@ def localize_new(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOut])
     return views
 
 
-def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], list[LeftOut]]:
+def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], list[LeftOutPhoto]]:
     """Read photos, downscaled to the size of the map's largest image; also return the photos that cannot be read."""
     side, background = longest_side(scene.info), scene.bounds.background
-    frames, unread = list[Any](), list[LeftOut]()
+    frames, unread = list[Any](), list[LeftOutPhoto]()
     source: Sequence[Frame] | Sequence[View] | Capture
     if not isinstance(photos, str | Path):
         source = photos.split(split) if isinstance(photos, Capture) else photos
@@ -184,7 +184,7 @@ def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], lis
     return [frame if side is None else frame.at_most(side) for frame in seen], unread
 
 
-def _old_views(scene: Map, data: Images | None, split: str) -> list[View]:
+def _old_views(scene: Map, data: ViewSource | None, split: str) -> list[View]:
     """Return the images in ``data`` at the map's poses or, without ``data``, renderings from the map's cameras."""
     if data is not None:
         _, views = views_again(scene.info, data, DatasetOptions(split=split))

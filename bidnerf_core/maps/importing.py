@@ -41,15 +41,15 @@ from bidnerf_core.maps.importers import ImportedField, Structure, bounds_about, 
 from bidnerf_core.maps.map import Map
 from bidnerf_core.maps.store import build_frozen_field, map_folder, write_parts
 from bidnerf_core.maps.training import MapOptions, bake_if_possible, bake_settings, settings_from
-from bidnerf_core.maps.views import USEFUL_SIDE, Images, Origin, ReadViews, choose_origin, read_views
+from bidnerf_core.maps.views import USEFUL_SIDE, Origin, ReadViews, ViewSource, choose_origin, read_views
 from bidnerf_core.progress import Cancel, ProgressCallback, job_context, log
 from bidnerf_core.settings import Above
 from bidnerf_core.training import TrainingState
 
-CAMERA = Intrinsics.from_hfov(70.0, 192, 192)
+RENDERED_CAMERA = Intrinsics.from_hfov(70.0, 192, 192)
 VIEWS = 48
 """Number of cameras placed around an object, and largest number of cameras placed inside a room."""
-DIRECTIONS = 48
+VIEW_DIRECTIONS = 48
 """Number of rays from each candidate position, spread evenly over the sphere."""
 
 
@@ -75,7 +75,7 @@ def import_map(
     out: str | Path | None = None,
     config: Any = None,
     *,
-    photos: Images | None = None,
+    photos: ViewSource | None = None,
     bake: bool | BakeConfig = True,
     options: ImportOptions = AS_IN_THE_FILE,
     progress: ProgressCallback | None = None,
@@ -339,18 +339,23 @@ def viewpoints(
         poses = _within(places[free], distance[free], up)
     else:  # from all around the box, at a distance from which it fills the images
         centre = torch.tensor(bounds.centre, dtype=torch.float64)
-        radius = 0.8 * math.dist(bounds.lower, bounds.upper) * math.hypot(CAMERA.fx, CAMERA.cx) / CAMERA.width
+        radius = (
+            0.8
+            * math.dist(bounds.lower, bounds.upper)
+            * math.hypot(RENDERED_CAMERA.fx, RENDERED_CAMERA.cx)
+            / RENDERED_CAMERA.width
+        )
         poses = [look_at(centre + radius * direction, centre, up) for direction in sphere(VIEWS)]
     rows: list[MatrixRows] = [(*((a, b, c, d) for a, b, c, d in pose.matrix().tolist()),) for pose in poses]
-    return tuple(StoredCamera(f"viewpoint-{n:03d}", CAMERA, row) for n, row in enumerate(rows))
+    return tuple(StoredCamera(f"viewpoint-{n:03d}", RENDERED_CAMERA, row) for n, row in enumerate(rows))
 
 
 @torch.no_grad()
 def _distances(field: RadianceField, bounds: SceneBounds, places: Float[Tensor, "p 3"]) -> Float[Tensor, "p d"]:
     """Return the distance at which each ray from ``places``, in evenly spread directions, hits geometry; 0 without a hit."""
     device = device_of(field)
-    origins = places[:, None].expand(-1, DIRECTIONS, 3).reshape(-1, 3).to(device)
-    towards = sphere(DIRECTIONS).float().expand(len(places), -1, -1).reshape(-1, 3).to(device)
+    origins = places[:, None].expand(-1, VIEW_DIRECTIONS, 3).reshape(-1, 3).to(device)
+    towards = sphere(VIEW_DIRECTIONS).float().expand(len(places), -1, -1).reshape(-1, 3).to(device)
     near = torch.full_like(origins[:, 0], bounds.near)
     seen = render(field, Rays(origins, towards, near, torch.full_like(near, bounds.far)), bounds.background)
     # A ray of less opacity hits nothing solid.
@@ -360,7 +365,7 @@ def _distances(field: RadianceField, bounds: SceneBounds, places: Float[Tensor, 
 
 def _within(places: Float[Tensor, "p 3"], distance: Float[Tensor, "p d"], up: tuple[float, float, float]) -> list[SE3]:
     """Return poses at free positions far from each other, facing the directions with the most distant geometry."""
-    directions, vertical = sphere(DIRECTIONS), torch.tensor(up, dtype=torch.float64)
+    directions, vertical = sphere(VIEW_DIRECTIONS), torch.tensor(up, dtype=torch.float64)
     level = (directions @ vertical).abs() < 0.75  # neither the ceiling nor the floor
     second, first = horizontal_axes(vertical)
     a, b = directions @ first, -directions @ second

@@ -69,7 +69,7 @@ from bidnerf_core.maps.store import (
     write_parts,
 )
 from bidnerf_core.maps.summary import MapSummary
-from bidnerf_core.maps.views import Images, views_again
+from bidnerf_core.maps.views import ViewSource, views_again
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context, log
 from bidnerf_core.training import TrainingState
 
@@ -231,7 +231,7 @@ class Map:
 
     def bake(
         self,
-        data: Images | None = None,
+        data: ViewSource | None = None,
         config: BakeConfig = USUAL_BAKE,
         *,
         images: DatasetOptions = AS_STORED,

@@ -75,7 +75,7 @@ def _json(value: Any) -> bytes:
 
 
 _STATE = PartFile(lambda tensors: tensors_to_bytes(pack_tensors(tensors)), lambda path: read_tensors(path, NEEDED))
-PARTS = {
+STORED_PARTS = {
     "weights": _STATE,
     "training": _STATE,
     "surface": PartFile(
@@ -131,7 +131,7 @@ def write_parts(
     }
     contents = {part: content for part, content in given.items() if content is not None}
     names: dict[str, Any] = {
-        part: f"{part}-{info.step:08d}-{secrets.token_hex(4)}.{PARTS[part].ending}" for part in contents
+        part: f"{part}-{info.step:08d}-{secrets.token_hex(4)}.{STORED_PARTS[part].ending}" for part in contents
     }
     if state is not None:
         names = dict.fromkeys(PART_NAMES) | ({"landmarks": info.landmarks} if keep else {}) | names
@@ -157,7 +157,7 @@ def write_parts(
             (folder / ANCHOR).unlink()
     try:
         for part, content in contents.items():
-            write_file(folder / names[part], PARTS[part].encode(content))
+            write_file(folder / names[part], STORED_PARTS[part].encode(content))
         write_file(folder / DESCRIPTION, description)
     finally:
         _sweep(folder)
@@ -263,7 +263,7 @@ def read_part(folder: Path, info: MapInfo, part: str) -> Any:
     The result is None if the map has no such part. Raises ``InputError`` if its file is damaged.
     """
     name = getattr(info, part)
-    found = PARTS[part].read(folder / name) if name else None
+    found = STORED_PARTS[part].read(folder / name) if name else None
     return with_images(found, info) if part == "landmarks" and found is not None else found
 
 
@@ -372,7 +372,7 @@ def content_digest(field: RadianceField, surface: SurfaceMap | None, landmarks: 
     weights = trained.state_dict() if isinstance(trained, nn.Module) else None
     for part, content in (("weights", weights), ("surface", surface), ("landmarks", landmarks)):
         if content is not None:
-            hashed.update(PARTS[part].encode(content))
+            hashed.update(STORED_PARTS[part].encode(content))
     return hashed.hexdigest()
 
 

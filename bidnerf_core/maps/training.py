@@ -48,7 +48,7 @@ from bidnerf_core.maps.store import (
     read_part,
     write_parts,
 )
-from bidnerf_core.maps.views import Images, ReadViews, choose_origin, read_views, views_again
+from bidnerf_core.maps.views import ReadViews, ViewSource, choose_origin, read_views, views_again
 from bidnerf_core.progress import Cancel, ProgressCallback, counter, duration_text, job_context, log
 from bidnerf_core.registry import USUAL_BACKEND, USUAL_POSER, PluginError
 from bidnerf_core.settings import NotNegative, Settings
@@ -100,7 +100,7 @@ class TrainOptions(MapOptions):
     """time between checkpoints: the most work lost if the program is killed"""
 
 
-USUAL = TrainOptions()
+USUAL_TRAINING = TrainOptions()
 
 
 class OtherSettings(InputError):
@@ -108,13 +108,13 @@ class OtherSettings(InputError):
 
 
 def train(
-    data: Images,
+    data: ViewSource,
     backend: str = USUAL_BACKEND,
     out: str | Path | None = None,
     config: Any = None,
     *,
     bake: bool | BakeConfig = True,
-    options: TrainOptions = USUAL,
+    options: TrainOptions = USUAL_TRAINING,
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
 ) -> Map:
@@ -224,7 +224,7 @@ def settings_from(config: Any, kind: type, what: str) -> Any:
 
 
 def _with_field(
-    scene: Map, data: Images, images: DatasetOptions, options: TrainOptions
+    scene: Map, data: ViewSource, images: DatasetOptions, options: TrainOptions
 ) -> tuple[Map, list[View], TrackedViews | None]:
     """Prepare a landmark-only map for training a field. Return the map, its images at the stored poses, and their keypoints."""
     info, images = scene.info, replace(images, largest=longest_side(scene.info))
@@ -260,11 +260,11 @@ def report_finished_parts(folder: Path | None) -> Iterator[None]:
 
 def resume(
     folder: str | Path,
-    data: Images,
+    data: ViewSource,
     *,
     bake: bool | BakeConfig = True,
     finish: bool = False,
-    options: TrainOptions = USUAL,
+    options: TrainOptions = USUAL_TRAINING,
     progress: ProgressCallback | None = None,
     cancel: Cancel | None = None,
 ) -> Map:
@@ -332,8 +332,8 @@ def bake_settings(bake: bool | BakeConfig) -> BakeConfig | None:
 
 @contextlib.contextmanager
 def open_posed_images(
-    data: Images, options: DatasetOptions, out: Path | None, overwrite: bool = False, poser: str = USUAL_POSER
-) -> Iterator[tuple[Images, DatasetOptions]]:
+    data: ViewSource, options: DatasetOptions, out: Path | None, overwrite: bool = False, poser: str = USUAL_POSER
+) -> Iterator[tuple[ViewSource, DatasetOptions]]:
     """Yield images with poses, and the options with which to read them.
 
     For a folder of photos without poses, or a video, structure from motion finds the poses and writes a

@@ -40,7 +40,7 @@ from bidnerf_core.io import available_memory, background_colour
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.progress import counter, log
 
-Images: TypeAlias = Capture | Sequence[View] | str | Path
+ViewSource: TypeAlias = Capture | Sequence[View] | str | Path
 """Images with poses: a dataset, the path to one, or views whose reference frame is the world."""
 
 Origin: TypeAlias = tuple[float, float, float]
@@ -107,7 +107,7 @@ class ReadViews:
 
 
 def read_views(
-    data: Images,
+    data: ViewSource,
     options: DatasetOptions = AS_STORED,
     depth_points: str | Path | None = None,
     point_choice: SparseChoice | None = None,
@@ -238,7 +238,7 @@ def _with_depth(read: ReadViews, model: Path, choice: SparseChoice, split: str) 
 
 def views_again(
     info: MapInfo,
-    data: Images,
+    data: ViewSource,
     options: DatasetOptions = AS_STORED,
     depth_points: str | Path | None = None,
     point_choice: SparseChoice | None = None,

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from bidnerf import SE3, Frame, View
-from bidnerf.testing import BOUNDS, CAMERA, ground, unseen
+from bidnerf.testing import BOUNDS, GROUND_CAMERA, ground, unseen
 from bidnerf_core.camera import STILL
 
 # Inside: the evidence of a common motion, of which a capture only shows the decision
@@ -183,7 +183,7 @@ def test_training_gets_the_motions(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_an_image_is_rendered_row_by_row() -> None:
-    motion, camera = motions(2.0)[1], CAMERA.scaled(0.25)
+    motion, camera = motions(2.0)[1], GROUND_CAMERA.scaled(0.25)
     frame = Frame("small", torch.zeros(camera.height, camera.width, 3), camera)
     view = View(frame, unseen().T_ref_camera)
     image = render_image(ground(), camera, view.T_ref_camera, BOUNDS, motion=motion)

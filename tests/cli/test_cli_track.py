@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from bidnerf import View
-from bidnerf.testing import CAMERA
+from bidnerf.testing import GROUND_CAMERA
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.datasets import open_dataset, read_trajectory, write_transforms
 from commands import Run, assert_refused
@@ -65,7 +65,7 @@ def test_images_without_a_focal_length_begin_with_the_camera_of_the_map(
     bidnerf: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     images = tmp_path / "images"
-    open_ground(monkeypatch, assumed=(CAMERA,))
+    open_ground(monkeypatch, assumed=(GROUND_CAMERA,))
     images.mkdir()
     for number, (_, frame, _) in enumerate(flight()[:3]):
         iio.imwrite(images / f"{number}.png", (255 * frame.rgb).round().byte().numpy())
@@ -101,7 +101,7 @@ def test_frames_of_another_scene_are_doubted(bidnerf: Run, tmp_path: Path) -> No
     random = np.random.default_rng(0)
     (tmp_path / "images").mkdir()
     for number in range(3):
-        noise = random.integers(0, 256, (CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
+        noise = random.integers(0, 256, (GROUND_CAMERA.height, GROUND_CAMERA.width, 3), dtype=np.uint8)
         iio.imwrite(tmp_path / "images" / f"{number}.png", noise)
     track = ("track", "MAP", tmp_path / "images", "--out", tmp_path / "path.json", "--hfov", "60")
     err = bidnerf(*track).succeed().err

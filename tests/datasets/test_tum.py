@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import open_dataset, open_sequence, read_trajectory
-from bidnerf_core.datasets.formats.tum import CAMERAS, associate
+from bidnerf_core.datasets.formats.tum import SENSORS, associate
 
 # Inside: the published cameras and the association of times, compared with OpenCV and SciPy
 from bidnerf_core.geometry import SE3
@@ -34,7 +34,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("sensor", ["1", "2", "3"])
 def test_published_lenses_can_be_inverted_everywhere(sensor: str) -> None:
-    camera = CAMERAS[sensor]
+    camera = SENSORS[sensor]
     pixels = camera.pixel_centres(torch.float64)[::20, ::20]
     torch.testing.assert_close(camera.project(camera.unproject(pixels)), pixels, atol=1e-6, rtol=0)
 
@@ -45,7 +45,7 @@ def test_the_published_lens_projects_as_opencv_does() -> None:
     lens = np.array([0.2624, -0.9531, -0.0054, 0.0026, 1.1633])
     points = np.random.default_rng(0).uniform([-0.6, -0.45, 1], [0.6, 0.45, 1], (50, 3))
     expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), published, lens)
-    found = CAMERAS["1"].project(torch.from_numpy(points))
+    found = SENSORS["1"].project(torch.from_numpy(points))
     np.testing.assert_allclose(found - 0.5, expected[:, 0], atol=1e-9)
 
 
@@ -64,7 +64,7 @@ def test_a_camera_that_is_given_goes_first(folder: Path, tmp_path: Path) -> None
 )
 def test_the_name_of_a_sensor_says_the_camera(name: str, sensor: str, folder: Path) -> None:
     """The folder's own name does, and the name that is given; a camera in the folder goes before the folder's name."""
-    expected = CAMERAS[sensor].resized(16, 12)
+    expected = SENSORS[sensor].resized(16, 12)
     if "_" not in name:
         assert next(iter(open_sequence(folder, camera=name))).frame.intrinsics == expected
         assert open_dataset(folder, camera=Path(name)).views("test")[0].frame.intrinsics == expected

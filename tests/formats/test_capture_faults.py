@@ -138,7 +138,7 @@ FAULTS: dict[str, list[tuple[str, Edit, str | tuple[str, ...]]]] = {
         ("rgb.txt", rows(lambda r: [*r, r[2]]), ("line 10", "1000.5", "line 6")),
         ("rgb.txt", content(b"\xff\xfe\x00\x01"), "is not text"),
         ("depth.txt", first_row("inf"), ("line 4", "inf")),
-        ("camera.json", Path.unlink, ("freiburg1", "camera.json or cameras.txt", "--camera")),
+        ("camera.json", Path.unlink, ("freiburg1", "camera.json or cameras.txt", "`camera`")),
         (DEPTH_OF_TUM, image((6, 6)), ("depth is 6x6", "16x12")),
     ],
     "seven-scenes": [
@@ -311,7 +311,7 @@ def test_a_folder_that_is_no_dataset(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
     (tmp_path / "notes/notes.txt").touch()
     for name, found, expected in (
-        ("none", "no such folder", None),
+        ("none", "no such folder", "a dataset"),
         (f"sound/{JSON}", f"is a file of a dataset; give its folder, {folder}", None),
         ("scan.zip", "is a file", "the folder of a dataset; unpack an archive first"),
         ("empty", "the folder is empty", "photos or a dataset in one of"),

@@ -14,7 +14,7 @@ import torch
 from bidnerf import Frame, Intrinsics, Localizer
 from bidnerf.evaluation import faulty
 from bidnerf.results import pose_error
-from bidnerf.testing import BOUNDS, CAMERA, textured_map, unseen
+from bidnerf.testing import BOUNDS, GROUND_CAMERA, textured_map, unseen
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import LandmarkMap
@@ -46,7 +46,7 @@ def landmarks_of(*cameras: Intrinsics) -> LandmarkMap:
 
 @pytest.mark.slow
 def test_the_command_finds_the_pose(bidnerf: Run, photo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stored(monkeypatch, landmarks_of(CAMERA))
+    stored(monkeypatch, landmarks_of(GROUND_CAMERA))
     _, out, err = bidnerf("localize", "MAP", photo, "--json").succeed()
     answer = json.loads(out)
     assert answer["converged"]
@@ -60,7 +60,7 @@ def test_the_command_finds_the_pose(bidnerf: Run, photo: Path, monkeypatch: pyte
 def test_methods_that_do_not_estimate_a_focal_length_need_one(
     bidnerf: Run, photo: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, option: list[str]
 ) -> None:
-    stored(monkeypatch, landmarks_of(CAMERA))
+    stored(monkeypatch, landmarks_of(GROUND_CAMERA))
     monkeypatch.chdir(tmp_path)
     pose = unseen().T_ref_camera.matrix().tolist()
     (tmp_path / "start.json").write_text(json.dumps({"T_world_camera": pose}))
@@ -80,10 +80,10 @@ def test_a_map_without_landmarks_does_not_tell_a_focal_length(
 
 @pytest.mark.parametrize("factor", [0.7, 2.0])
 def test_a_wrong_focal_length_from_the_photo_gives_way_to_that_of_the_map(photo: Path, factor: float) -> None:
-    wrong = replace(CAMERA, fx=CAMERA.fx * factor, fy=CAMERA.fy * factor)
+    wrong = replace(GROUND_CAMERA, fx=GROUND_CAMERA.fx * factor, fy=GROUND_CAMERA.fy * factor)
     frame = Frame.read(photo, CameraSource(assumed=(wrong,)))
     assert frame.focal_is_approximate
-    localizer = Localizer(replace(textured_map(surface=True), landmarks=landmarks_of(CAMERA)))
+    localizer = Localizer(replace(textured_map(surface=True), landmarks=landmarks_of(GROUND_CAMERA)))
     for given, remark in (
         (frame, ", with the map's camera"),
         (frame.replace(focal_is_approximate=False), ", with the map's camera instead of the stated one"),
@@ -97,12 +97,12 @@ def test_a_wrong_focal_length_from_the_photo_gives_way_to_that_of_the_map(photo:
 
 def test_a_portrait_photo_in_a_map_of_landscape_ones_has_their_camera() -> None:
     rgb = torch.rot90(unseen().frame.rgb, 1, (0, 1)).contiguous()
-    camera = Intrinsics.from_focal(1.2 * CAMERA.fx, CAMERA.height, CAMERA.width)
+    camera = Intrinsics.from_focal(1.2 * GROUND_CAMERA.fx, GROUND_CAMERA.height, GROUND_CAMERA.width)
     frame = Frame("portrait", rgb, camera, focal_is_approximate=True)
-    found = Localizer(replace(textured_map(surface=True), landmarks=landmarks_of(CAMERA)))(frame)
+    found = Localizer(replace(textured_map(surface=True), landmarks=landmarks_of(GROUND_CAMERA)))(frame)
     assert found.converged
     # Rays do not decide between the map's camera and one whose focal length is estimated.
-    assert require(found.intrinsics).fx == pytest.approx(CAMERA.fx, rel=0.03)
+    assert require(found.intrinsics).fx == pytest.approx(GROUND_CAMERA.fx, rel=0.03)
     turn = SE3.exp(torch.tensor([0, 0, 0, 0, 0, math.pi / 2], dtype=torch.float64))
     error = pose_error(found.T_world_camera, unseen().T_ref_camera @ turn)
     assert error.translation < 0.02
@@ -113,7 +113,7 @@ def test_a_portrait_photo_in_a_map_of_landscape_ones_has_their_camera() -> None:
 @pytest.mark.parametrize(("factor", "has_landmarks"), [(0.7, True), (1.0, False), (1.15, False)])
 def test_colours_alone_do_not_tell_an_approximate_focal_length(photo: Path, factor: float, has_landmarks: bool) -> None:
     """Neither landmarks of unknown cameras nor colours: the ground looks nearly flat."""
-    wrong = replace(CAMERA, fx=CAMERA.fx * factor, fy=CAMERA.fy * factor)
+    wrong = replace(GROUND_CAMERA, fx=GROUND_CAMERA.fx * factor, fy=GROUND_CAMERA.fy * factor)
     frame = Frame.read(photo, CameraSource(assumed=(wrong,)))
     known = landmarks_of() if has_landmarks else None
     assert not Localizer(replace(textured_map(surface=True), landmarks=known))(frame).converged
@@ -121,11 +121,11 @@ def test_colours_alone_do_not_tell_an_approximate_focal_length(photo: Path, fact
 
 def test_nor_do_those_of_a_blurred_photo() -> None:
     blurred = faulty(unseen(), "blur:3.5", 0).frame
-    camera = replace(CAMERA, fx=CAMERA.fx * 1.1, fy=CAMERA.fy * 1.1)
+    camera = replace(GROUND_CAMERA, fx=GROUND_CAMERA.fx * 1.1, fy=GROUND_CAMERA.fy * 1.1)
     frame = replace(blurred, depth=None, intrinsics=camera, focal_is_approximate=True)
     assert not Localizer(replace(textured_map(surface=True), landmarks=None))(frame).converged
 
 
 def test_colours_alone_suffice_with_a_known_focal_length(photo: Path) -> None:
-    frame = Frame.open(photo, camera=CAMERA)
+    frame = Frame.open(photo, camera=GROUND_CAMERA)
     assert Localizer(replace(textured_map(surface=True), landmarks=None))(frame).converged

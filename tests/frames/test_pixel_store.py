@@ -104,7 +104,7 @@ def test_reducing_a_frame_keeps_colours_rays_and_what_is_hidden() -> None:
 
 @pytest.mark.parametrize("expected", [0, 2**40], ids=["memory", "file"])
 def test_a_store_returns_what_is_put_into_it(expected: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(storage, "BLOCK", 9000)
+    monkeypatch.setattr(storage, "FILE_BLOCK", 9000)
     views = some_views(8)
     depth = torch.rand(16, 24)
     frames = [views[0].frame.replace(depth=depth, alpha=depth, hidden=depth > 0.5)]
@@ -190,7 +190,7 @@ def test_large_images_are_read_at_the_size_that_is_of_use(
 
     small = read_views(tmp_path, DatasetOptions(largest=96)).views
     assert [view.frame.intrinsics for view in small] == [Intrinsics(75.0, 75.0, 47.5, 30.0, 96, 60)] * 2
-    assert "2 images of 192x120 read at 96x60, 0 MB; --largest (largest=) sets another size" in caplog.text
+    assert "2 images of 192x120 read at 96x60, 0 MB; `largest` sets another size" in caplog.text
     monkeypatch.setattr(views_of_map, "MOST_BYTES", 10_000)
     monkeypatch.setattr(views_of_map, "LEAST_SIDE", 20)
     frame = open_dataset(tmp_path).views("train", ["1"])[0].frame

@@ -19,9 +19,8 @@ import torch
 from bidnerf import SE3, Intrinsics, Localization, Localizer, Outcome, View
 from bidnerf.evaluation import faulty
 from bidnerf.results import pose_error
-from bidnerf.testing import CAMERA as GROUND_CAMERA
+from bidnerf.testing import GROUND_CAMERA, TexturedGround, textured_map, training_views, unseen
 from bidnerf.testing import POSES as GROUND_POSES
-from bidnerf.testing import TexturedGround, textured_map, training_views, unseen
 from bidnerf.testing import seen as seen_ground
 from bidnerf_core.fields import FieldValues
 from bidnerf_core.localization import AutoConfig, LandmarkAnswer, LandmarkMatcher, LogisticModel, Loop, rig

@@ -19,7 +19,8 @@ from safetensors.torch import save_file
 
 from bidnerf import Localizer, Outcome, Tracker
 from bidnerf.results import normalized_error_squared, pose_error
-from bidnerf.testing import CAMERA, textured_map
+from bidnerf.testing import GROUND_CAMERA as CAMERA
+from bidnerf.testing import textured_map
 from bidnerf.testing import textured_view as view
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3

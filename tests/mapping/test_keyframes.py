@@ -13,7 +13,7 @@ from bidnerf import SE3, View
 
 # Inside: the limits on the number and size of keyframes, which a map does not state
 from bidnerf.scenes import HomogeneousBall, orbit
-from bidnerf.testing import BOUNDS, CAMERA, ground, training_views, unseen
+from bidnerf.testing import BOUNDS, GROUND_CAMERA, ground, training_views, unseen
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import SceneBounds, Stratified
 from bidnerf_core.localization import LandmarkMatcher, Loop
@@ -56,7 +56,7 @@ def test_keyframes_are_as_many_and_as_large_as_is_useful_at_most() -> None:
 
 def test_landmarks_of_keyframes_find_a_photo() -> None:
     """They stand in for the photos of a map that came without."""
-    views = render_views(ground(), BOUNDS, [(CAMERA, view.T_ref_camera) for view in training_views()[:6]])
+    views = render_views(ground(), BOUNDS, [(GROUND_CAMERA, view.T_ref_camera) for view in training_views()[:6]])
     found = require(Loop([View(unseen().frame, SE3.identity())], LandmarkMatcher(build_landmarks(views)))())
     assert_near(found.T_world_rig, unseen().T_ref_camera, 0.02, 0.5)
 

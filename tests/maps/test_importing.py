@@ -69,7 +69,7 @@ class TinyImporter:
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A file that exactly one importer reads; where it has no photos, the field is seen from few places."""
     monkeypatch.setitem(registered, ("importers", "tiny"), TinyImporter())
-    for name, value in (("VIEWS", FEW), ("CAMERA", Intrinsics.from_hfov(70, 32, 32))):
+    for name, value in (("VIEWS", FEW), ("RENDERED_CAMERA", Intrinsics.from_hfov(70, 32, 32))):
         monkeypatch.setattr(f"bidnerf_core.maps.importing.{name}", value)
     path = tmp_path / "field.tiny"
     path.touch()

@@ -19,7 +19,7 @@ import bidnerf_core.maps.collection as collections_module
 from bidnerf.scenes import orbit
 from bidnerf.service import Upload
 from bidnerf.service.worker import LoadedMaps
-from bidnerf.testing import BOUNDS, CAMERA, POSES, ground
+from bidnerf.testing import BOUNDS, GROUND_CAMERA, POSES, ground
 from bidnerf.testing import textured_view as view
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.captures import stored_cameras
@@ -73,8 +73,8 @@ def test_the_map_that_an_image_shows_is_found(grounds: list[Map]) -> None:
 
 def test_transparent_pixels_show_the_background_of_the_map(grounds: list[Map], tmp_path: Path) -> None:
     """The background is that of whichever map a photo is tried in, unless the user names another."""
-    rgb, alpha = photo(SEEDS[0]).frame.rgb.numpy(), np.zeros((CAMERA.height, CAMERA.width, 1), np.float32)
-    alpha[: CAMERA.height // 2] = 1.0
+    rgb, alpha = photo(SEEDS[0]).frame.rgb.numpy(), np.zeros((GROUND_CAMERA.height, GROUND_CAMERA.width, 1), np.float32)
+    alpha[: GROUND_CAMERA.height // 2] = 1.0
     rgba = (255 * np.concatenate([rgb, alpha], axis=-1)).round().astype(np.uint8)
     iio.imwrite(tmp_path / "cut.png", rgba)
     for background in ((0.0, 0.0, 0.0), (1.0, 0.5, 0.25)):
@@ -82,13 +82,13 @@ def test_transparent_pixels_show_the_background_of_the_map(grounds: list[Map], t
         localizer = bn.Localizer(replace(grounds[0], info=info), warm_up=False)
         behind = (alpha * rgb + (1 - alpha) * np.float32(background))[-1, -1]
         for frame in (
-            bn.Frame.open(tmp_path / "cut.png", camera=CAMERA),
-            bn.Frame.from_numpy(rgba, CAMERA),
-            bn.Frame.read(tmp_path / "cut.png", CameraSource(CAMERA), background=background),
+            bn.Frame.open(tmp_path / "cut.png", camera=GROUND_CAMERA),
+            bn.Frame.from_numpy(rgba, GROUND_CAMERA),
+            bn.Frame.read(tmp_path / "cut.png", CameraSource(GROUND_CAMERA), background=background),
         ):
             (seen,) = localizer.problem(frame).views
             np.testing.assert_allclose(seen.frame.rgb[-1, -1], behind, atol=1 / 255)
-    white = bn.Frame.read(tmp_path / "cut.png", CameraSource(CAMERA), background="white")
+    white = bn.Frame.read(tmp_path / "cut.png", CameraSource(GROUND_CAMERA), background="white")
     assert float(bn.Localizer(grounds[0], warm_up=False).problem(white).views[0].frame.rgb[-1, -1].min()) == 1
 
 
@@ -111,7 +111,7 @@ def test_the_service_finds_the_map_of_a_photo(grounds: list[Map], tmp_path: Path
     assert require(worker.together).localizer("b") is localizers["b"]
     assert LoadedMaps({"a": localizers["a"]}, 1e6).together is None
     png = iio.imwrite("<bytes>", (255 * photo(SEEDS[1]).frame.rgb).byte().numpy(), extension=".png")
-    task = {"map": None, "upload": Upload({"name": "<i>", "focal": CAMERA.fx}, {"photo": png})}
+    task = {"map": None, "upload": Upload({"name": "<i>", "focal": GROUND_CAMERA.fx}, {"photo": png})}
     reply = worker.answer(task, tmp_path)
     assert reply["status"] == 200, reply
     body = reply["body"]
@@ -124,16 +124,16 @@ def test_the_service_finds_the_map_of_a_photo(grounds: list[Map], tmp_path: Path
 def test_landmarks_that_a_camera_sees(grounds: list[Map]) -> None:
     landmarks = require(grounds[0].landmarks)
     camera = grounds[0].info.cameras[0]
-    seen = visible(landmarks, CAMERA, camera.pose)
+    seen = visible(landmarks, GROUND_CAMERA, camera.pose)
     assert 0.2 * len(landmarks) < len(seen.unique()) == len(seen) <= len(landmarks)
     away = bn.SE3(camera.pose.rotation @ torch.diag(torch.tensor([1.0, -1, -1]).double()), camera.pose.translation)
-    assert not len(visible(landmarks, CAMERA, away))
+    assert not len(visible(landmarks, GROUND_CAMERA, away))
 
 
 def test_maps_without_landmarks_come_last(grounds: list[Map]) -> None:
     maps = bn.MapCollection([grounds[2], grounds[0]])
     assert list(maps.rank(view(POSES[1]).frame)) == ["ground0", "bare"]
-    dark = bn.Frame.from_numpy(np.zeros((96, 128, 3), np.uint8), CAMERA)
+    dark = bn.Frame.from_numpy(np.zeros((96, 128, 3), np.uint8), GROUND_CAMERA)
     assert set(maps.rank(dark).values()) == {-1.0}
 
 
@@ -147,7 +147,7 @@ def test_the_limit_counts_only_maps_that_can_be_compared(grounds: list[Map], mon
     monkeypatch.setattr(maps, "_by_landmarks", lambda *_: none)
     monkeypatch.setattr(maps, "localizer", lambda name: lambda frame, seed: none)
     assert maps(photo(SEEDS[1]).frame).tried == ("ground4", *bare)
-    assert set(maps(bn.Frame.from_numpy(np.zeros((96, 128, 3), np.uint8), CAMERA)).tried) == set(maps.names)
+    assert set(maps(bn.Frame.from_numpy(np.zeros((96, 128, 3), np.uint8), GROUND_CAMERA)).tried) == set(maps.names)
 
 
 def test_what_is_no_map_is_refused(grounds: list[Map], tmp_path: Path) -> None:

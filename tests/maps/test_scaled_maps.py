@@ -12,7 +12,7 @@ import torch
 import bidnerf as bn
 import tiny
 from bidnerf.results import read_positions
-from bidnerf.testing import BOUNDS, CAMERA, textured_map, unseen
+from bidnerf.testing import BOUNDS, textured_map, unseen
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.fields import levels
 from bidnerf_core.io import FileInUse, lock

@@ -41,6 +41,27 @@ def test_public_functions_are_annotated(trees: dict[str, ast.Module]) -> None:
     assert {name: parts for name, parts in bare.items() if parts} == {}
 
 
+SEVERAL_HOMES = {"T", "log", "reader"}
+"""A type variable, the logger of a module, and the object of each format that an entry point names."""
+
+
+def test_classes_and_constants_have_one_home(trees: dict[str, ast.Module]) -> None:
+    """Whoever reads a name knows what it is, in both packages."""
+    homes = dict[str, list[str]]()
+    for name, tree in trees.items():
+        if not name.startswith("backends"):
+            for each in {n for node in tree.body for n in _defined(node) if not n.startswith("_")}:
+                homes.setdefault(each, []).append(name)
+    assert {each: files for each, files in homes.items() if len(files) > 1 and each not in SEVERAL_HOMES} == {}
+
+
+def _defined(node: ast.stmt) -> Iterator[str]:
+    if isinstance(node, ast.ClassDef):
+        yield node.name
+    targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
+    yield from (n.id for target in targets for n in ast.walk(target) if isinstance(n, ast.Name))
+
+
 BY_NAME = {
     "bidnerf/__init__.py": {"import_module"},  # what its stub names
     "bidnerf_core/registry.py": {"entry_points"},

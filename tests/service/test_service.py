@@ -46,7 +46,7 @@ from bidnerf import InputError, ServiceClient, open_dataset, serve
 from bidnerf.service import Application, ServiceError, ServiceLimits, public_message, run_app, service_app
 
 # Inside: workers are killed, and the description is compared with the parameters that are read
-from bidnerf.service.models import Localization, MapFacts, PhotoForm
+from bidnerf.service.models import LocalizationBody, MapFacts, PhotoForm
 from bidnerf.service.pool import Pool
 from bidnerf.service.server import maps_by_name
 from bidnerf.service.web import SAFE, Gate
@@ -265,7 +265,7 @@ def test_answers_are_those_of_the_command_line(service: Service, inputs: Inputs,
     reply = service.post("/maps/map/localize", body, FORM)
     assert reply.status == 200
     assert list(reply.json) == list(expected)
-    Localization.model_validate(reply.json)
+    LocalizationBody.model_validate(reply.json)
     assert reply.json["loss"] == pytest.approx(expected["loss"], rel=1e-6)
     same = expected.keys() - {"seconds", "loss"}
     assert {key: reply.json[key] for key in same} == {key: expected[key] for key in same}

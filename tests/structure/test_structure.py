@@ -27,8 +27,8 @@ from bidnerf.structure.colmap import NEIGHBOURS, list_photos, similar_pairs, to_
 from bidnerf.structure.model import count_contradictions, from_colmap
 from bidnerf.structure.record import digest, open_work, remove_output
 from bidnerf.structure.sources import (
+    FRAME_STEP,
     MOST,
-    STEP,
     SourceImage,
     choose_frames,
     measure_frames,
@@ -380,9 +380,9 @@ def test_many_photos_are_matched_with_neighbours_and_those_that_look_alike() -> 
 def test_frames_are_chosen_at_equal_steps_of_motion_the_sharpest_near_each() -> None:
     still = [(0.0, 0.0)] * 20
     assert choose_frames(still) == [0]
-    moving = [(0.1 * STEP * n, -float(n % 10 != 1)) for n in range(101)]
+    moving = [(0.1 * FRAME_STEP * n, -float(n % 10 != 1)) for n in range(101)]
     assert choose_frames(moving) == [1, 11, 21, 31, 41, 51, 61, 71, 81, 91, 98]
-    long = [(STEP * n, 0.0) for n in range(3 * MOST)]
+    long = [(FRAME_STEP * n, 0.0) for n in range(3 * MOST)]
     assert MOST / 2 < len(choose_frames(long)) <= MOST
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bidnerf import SE3, Intrinsics, View
 from bidnerf.evaluation import faulty
-from bidnerf.testing import CAMERA, MapWithLandmarks, textured_map
+from bidnerf.testing import GROUND_CAMERA, MapWithLandmarks, textured_map
 from bidnerf.testing import POSES as GROUND_POSES
 from bidnerf.testing import textured_view as view_of_ground
 from bidnerf_core.localization import settings_of
@@ -141,7 +141,7 @@ def ground_landmarks(features: str = "sift", scatter: float = 0.01) -> LandmarkM
     """Return landmarks of a map whose images hardly show which focal length is right: their own estimates scatter."""
     landmarks = require(textured_map().landmarks)
     deviations = torch.full((4,), scatter, dtype=torch.float64)
-    cameras = (CAMERA,)
+    cameras = (GROUND_CAMERA,)
     return replace(landmarks, features=features, calibration_scatter=deviations, correlation=1.0, cameras=cameras)
 
 

@@ -35,7 +35,7 @@ from bidnerf_core.datasets.reader import DatasetOptions, Format
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import natural_order
 
-MODELS = (
+MODEL_FOLDERS = (
     "sparse",
     "colmap/sparse",
     ".",
@@ -46,7 +46,7 @@ MODELS = (
     "model",
 )
 """Where to look for a model, or numbered folders of models, in order of preference."""
-IMAGES = (
+IMAGE_FOLDERS = (
     "images",
     "images_2",
     "images_4",
@@ -112,7 +112,7 @@ def colmap_project(path: Path) -> tuple[Path, Path, list[ModelImage], dict[int, 
 
 def colmap_models(path: Path) -> list[Path]:
     """Return the models at the first location that contains any."""
-    return next((models for name in MODELS if (models := _models_at(path / name))), [])
+    return next((models for name in MODEL_FOLDERS if (models := _models_at(path / name))), [])
 
 
 def _models_at(folder: Path) -> list[Path]:
@@ -145,8 +145,8 @@ def _largest(path: Path, models: Sequence[Path]) -> tuple[Path, list[ModelImage]
 def _image_folder(path: Path, model: Path, images: Sequence[ModelImage]) -> tuple[Path, dict[str, Path]]:
     """Return the folder that holds most of the images, and the image files by their names in the model."""
     beside = [model.parent / "images", model.parent.parent / "images"]
-    folders = list(dict.fromkeys([*beside, *(path / name for name in IMAGES)]))
-    best: tuple[Path, dict[str, Path]] = (path / IMAGES[0], {})
+    folders = list(dict.fromkeys([*beside, *(path / name for name in IMAGE_FOLDERS)]))
+    best: tuple[Path, dict[str, Path]] = (path / IMAGE_FOLDERS[0], {})
     for folder in filter(Path.is_dir, folders):
         names = FileNames(folder)
         files = {image.name: file for image in images if (file := names.find(posix_name(image.name))) is not None}

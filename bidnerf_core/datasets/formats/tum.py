@@ -43,7 +43,7 @@ from bidnerf_core.depth import DepthReader
 from bidnerf_core.errors import amount
 from bidnerf_core.io import is_file
 
-CAMERAS = {
+SENSORS = {
     "1": Intrinsics(517.3, 516.5, 319.1, 255.8, 640, 480, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     "2": Intrinsics(520.9, 521.0, 325.6, 250.2, 640, 480, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
     "3": Intrinsics(535.4, 539.2, 320.6, 248.1, 640, 480),
@@ -107,7 +107,7 @@ def _published_camera(name: str, whole: bool = False) -> Intrinsics | None:
     """Return the benchmark's calibration of the sensor that ``name`` contains (or is, with ``whole``), or None."""
     sensor = re.compile(r"(?:freiburg|fr)_?([123])(?!\d)", re.IGNORECASE)
     match = sensor.fullmatch(name) if whole else sensor.search(name)
-    return CAMERAS[match[1]] if match else None
+    return SENSORS[match[1]] if match else None
 
 
 def _file(row: TimedRow, names: FileNames) -> Path:

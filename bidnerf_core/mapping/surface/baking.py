@@ -34,11 +34,11 @@ from bidnerf_core.mapping.surface.surfel_index import MOST_CELLS, SurfelIndex
 from bidnerf_core.progress import counter
 from bidnerf_core.settings import Above, Range, Settings
 
-Camera = tuple[Intrinsics, SE3]
+PosedCamera = tuple[Intrinsics, SE3]
 """Intrinsics and T_world_camera."""
 
 
-def render_views(field: RadianceField, bounds: SceneBounds, cameras: Sequence[Camera]) -> list[View]:
+def render_views(field: RadianceField, bounds: SceneBounds, cameras: Sequence[PosedCamera]) -> list[View]:
     """Render colour and depth of ``field`` at up to 100 of ``cameras``, at regular intervals, for a map without photos."""
     chosen = cameras[:: max(1, math.ceil(len(cameras) / 100))]
     views, count = list[View](), counter("rendering", "views")
@@ -119,7 +119,7 @@ def surface_of_points(
     points: Float[Tensor, "p 3"],
     rgb: Float[Tensor, "p 3"],
     bounds: SceneBounds,
-    cameras: Sequence[Camera],
+    cameras: Sequence[PosedCamera],
     config: BakeConfig = BakeConfig(),
 ) -> SurfaceMap:
     """Bake the surface from points on it (metres, world), such as a scan's; ``cameras`` become its keyframes.

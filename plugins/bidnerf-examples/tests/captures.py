@@ -9,11 +9,11 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 
-from bidnerf.testing import CAMERA, training_views
+from bidnerf.testing import GROUND_CAMERA, training_views
 
 
 def write_capture(folder: Path) -> Path:
-    c = CAMERA
+    c = GROUND_CAMERA
     camera = {"fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, "w": c.width, "h": c.height}
     (folder / "camera.json").write_text(json.dumps(camera))
     with (folder / "poses.csv").open("w", newline="") as opened:
