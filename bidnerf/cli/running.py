@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import sys
-import threading
 import time
 from collections.abc import Iterator
 
@@ -96,17 +95,10 @@ def interruptible_work(
 
     Once the work has stopped at a check, a line states what was kept, and ``Interrupted`` is raised.
     """
-    handler, announced = installed_handler(), threading.Event()
-
-    def cancel() -> bool:
-        if handler.waiting is not None and not announced.is_set():  # not in the handler, which may interrupt a print
-            announced.set()
-            say(announcement)
-        return handler.waiting is not None
-
-    handler.works = True
+    handler = installed_handler()
+    handler.works, handler.announce = True, lambda: say(announcement)
     try:
-        with job_context(cancel=cancel), display_progress():
+        with job_context(cancel=lambda: handler.waiting is not None), display_progress():
             yield
     except Cancelled as stopped:
         if handler.waiting is None:  # something other than Ctrl-C stopped it

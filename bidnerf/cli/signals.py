@@ -6,7 +6,7 @@ import contextlib
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
 
 # Windows has no SIGHUP.
@@ -29,6 +29,7 @@ class Handler:
         self.writes = False  # every signal waits until results are written
         self.works = False  # the first Ctrl-C waits until the work next checks whether to stop
         self.waiting: int | None = None
+        self.announce: Callable[[], object] = lambda: None  # tells the user that the work will stop
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         if os.getpid() != self.process:  # a forked worker ends as it would without this handler
@@ -36,6 +37,8 @@ class Handler:
             os.kill(os.getpid(), number)
         elif self.writes or (self.works and number == signal.SIGINT and self.waiting is None):
             self.waiting = number
+            if not self.writes:  # on a thread, since the handler may have interrupted a print
+                threading.Thread(target=self.announce).start()
         else:
             raise Interrupted(number)
 

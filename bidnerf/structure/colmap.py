@@ -7,6 +7,8 @@ EXIF or a typical one, and is refined together with the poses. A camera given by
 from __future__ import annotations
 
 import contextlib
+import signal
+import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -53,6 +55,11 @@ def import_pycolmap(what: str) -> Any:
     """
     try:
         import pycolmap
+
+        if (
+            threading.current_thread() is threading.main_thread()
+        ):  # pycolmap's handler prints a stack and ends the process
+            signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
     except ImportError as error:
         raise InputError(
             "finding the poses of photos needs the extra 'sfm' (pip install 'bidnerf[sfm]')", where=what

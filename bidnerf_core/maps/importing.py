@@ -39,12 +39,11 @@ from bidnerf_core.mapping import (
 from bidnerf_core.maps.description import MapInfo, cameras_of
 from bidnerf_core.maps.importers import ImportedField, Structure, bounds_about, importer_of, robust_box
 from bidnerf_core.maps.map import Map
-from bidnerf_core.maps.store import build_frozen_field, map_folder, write_parts
+from bidnerf_core.maps.store import build_frozen_field, map_folder
 from bidnerf_core.maps.training import MapOptions, bake_if_possible, bake_settings, settings_from
 from bidnerf_core.maps.views import USEFUL_SIDE, Origin, ReadViews, ViewSource, choose_origin, read_views
 from bidnerf_core.progress import Cancel, ProgressCallback, job_context, log
 from bidnerf_core.settings import Above
-from bidnerf_core.training import TrainingState
 
 RENDERED_CAMERA = Intrinsics.from_hfov(70.0, 192, 192)
 VIEWS = 48
@@ -115,7 +114,8 @@ def import_map(
         if found.structure is not None:
             if photos is not None:
                 raise InputError("is a model with photos of its own; leave out the photos", where=where)
-            return _of_structure(found, found.structure, options, folder, baking is not None)
+            scene = _of_structure(found, found.structure, options, baking is not None)
+            return scene if folder is None else scene.write_to(folder)
         images = photos
         if images is None and found.photos is not None:
             try:
@@ -164,18 +164,13 @@ def import_map(
                     InputWarning,
                     stacklevel=2,
                 )
-        if folder is not None:
-            scene = replace(
-                scene, info=write_parts(folder, scene.info, TrainingState(step, found.tensors, {})), folder=folder
-            )
-        if baking is None:
-            return scene
-        return bake_if_possible(scene, lambda scene: _bake(scene, found, views, baking))
+        if baking is not None:
+            scene = _bake(scene, found, views, baking)
+        # Written once all of it is there: a map that lacks its landmarks would pass for a complete one.
+        return scene if folder is None else scene.write_to(folder)
 
 
-def _of_structure(
-    found: ImportedField, structure: Structure, options: ImportOptions, folder: Path | None, bake: bool
-) -> Map:
+def _of_structure(found: ImportedField, structure: Structure, options: ImportOptions, bake: bool) -> Map:
     """Build a landmark-only map from posed images and the points that they observe."""
     capture, features = structure.capture, options.features
     origin = choose_origin(
@@ -203,8 +198,6 @@ def _of_structure(
         origin=origin,
     )
     scene = Map(info, NoField()).to(working_device(options.device))
-    if folder is not None:
-        scene = replace(scene, info=write_parts(folder, info, TrainingState(0, {}, {})), folder=folder)
     if not bake:
         return scene
     if tracked is None:
@@ -297,22 +290,33 @@ def ratio_to_measured_depth(field: RadianceField, bounds: SceneBounds, views: Se
 
 
 def _bake(scene: Map, found: ImportedField, views: Sequence[View], config: BakeConfig) -> Map:
-    name, surface = scene.info.data, None
-    if found.surface is not None:
-        surface = surface_of_points(*found.surface, scene.bounds, cameras_of(scene.info), config)
-        log.info(
-            f"{name}: surface of {len(surface.surfels)} surfels from its own points, in cells with a side of"
-            f" {surface.cell:.3g}, {surface.mebibytes:.1f} MiB"
-        )
-    if not views and not found.is_coloured:
+    name = scene.info.data
+    tracked: TrackedViews | None = None
+
+    def with_surface(scene: Map) -> Map:
+        surface = None
+        if found.surface is not None:
+            surface = surface_of_points(*found.surface, scene.bounds, cameras_of(scene.info), config)
+            log.info(
+                f"{name}: surface of {len(surface.surfels)} surfels from its own points, in cells with a side of"
+                f" {surface.cell:.3g}, {surface.mebibytes:.1f} MiB"
+            )
         return scene.with_surface(views, config, surface)
-    if not views:
+
+    def with_landmarks(scene: Map) -> Map:
+        nonlocal tracked
+        scene, tracked = scene.with_landmarks(views, not views)
+        return scene
+
+    if not views and found.is_coloured:
         log.info(
             f"{name}: landmarks are from rendered images, which match photos less well; `photos` builds them from photos,"
             " as in training"
         )
-    scene, tracked = scene.with_landmarks(views, not views)
-    return scene.with_surface(views, config, surface).with_survey(views, tracked)
+    if views or found.is_coloured:
+        scene = bake_if_possible(scene, with_landmarks)
+    scene = bake_if_possible(scene, with_surface)
+    return scene if tracked is None else scene.with_survey(views, tracked)
 
 
 def viewpoints(

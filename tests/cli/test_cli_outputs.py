@@ -24,10 +24,12 @@ import torch
 from bidnerf import SE3, Frame, InputError, Intrinsics, Localization, Localizer, Outcome, Tracker
 from bidnerf.cli import main
 from bidnerf.cli.output import check_folder, check_output
+from bidnerf.cli.running import interruptible_work
 from bidnerf.cli.signals import Interrupted, defer_interruptions, interruptions
 from bidnerf.results import Answers
 from bidnerf_core.datasets import DatasetFrames, Query, read_trajectory
 from bidnerf_core.errors import UsageError
+from bidnerf_core.progress import check_cancelled
 from commands import Run, assert_refused
 from flights import flight
 from stored_ground import open_ground, write_flight
@@ -161,6 +163,25 @@ def test_handlers_are_as_before_after_a_command_and_ignored_signals_stay_ignored
             os.kill(os.getpid(), signal.SIGHUP)
     finally:
         signal.signal(signal.SIGHUP, before[2])
+
+
+@pytest.mark.usefixtures("no_signal_ignored")
+def test_ctrl_c_is_acknowledged_before_the_work_can_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = list[str]()
+    monkeypatch.setattr("bidnerf.cli.running.say", lines.append)
+
+    def work() -> None:
+        with interruptions(), interruptible_work("will stop"):
+            os.kill(os.getpid(), signal.SIGINT)
+            until = time.monotonic() + 10
+            while not lines and time.monotonic() < until:
+                time.sleep(0.01)
+            assert lines == ["will stop"]
+            check_cancelled("this work")
+
+    with pytest.raises(Interrupted):
+        work()
+    assert lines == ["will stop", "cancelled during stage 'this work'"]
 
 
 def test_an_interruption_while_results_are_written_waits_for_them() -> None:

@@ -319,6 +319,22 @@ def test_each_photo_that_is_left_out_has_a_reason(model: Model, caplog: pytest.L
     assert "left out: 005.png: it observes fewer than 6 points" in caplog.text
 
 
+def test_an_import_leaves_a_whole_map_or_nothing(model: Model, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    model.write_database(model.folder / "database.db")
+    out, there = tmp_path / "map", list[str]()
+
+    def killed(*_: Any, **__: Any) -> Any:
+        there.extend(file.name for file in out.iterdir())
+        raise InputError("no memory")
+
+    with monkeypatch.context() as patch, refused(found="no memory"):
+        patch.setattr(bn.Map, "with_landmarks", killed)
+        bn.import_map(model.folder, out)
+    assert (there, out.exists()) == ([], False)
+    assert bn.import_map(model.folder, out).landmarks is not None
+    assert bn.load_map(out).landmarks is not None
+
+
 def test_a_model_is_scaled_and_placed(model: Model) -> None:
     place = SE3.exp(torch.tensor([5.0, -3.0, 1.0, 0.4, 0.2, -0.7], dtype=torch.float64))
     model.write_database(model.folder / "database.db")

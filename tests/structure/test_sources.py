@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -33,3 +35,13 @@ def test_panoramas_are_not_taken_for_pinhole_images(tmp_path: Path) -> None:
     (tmp_path / "0.jpg").unlink()  # a photo that cannot be read is left out later
     with refused(where=tmp_path / "1.jpg", found="is a panorama", expected="EQUIRECTANGULAR"):
         refuse_panoramas(photos)
+
+
+def test_signals_go_on_to_their_handlers_after_pycolmap_is_imported() -> None:
+    pytest.importorskip("pycolmap", reason="the extra 'sfm' is not installed")
+    program = (
+        "import os, signal, sys; signal.signal(signal.SIGTERM, lambda *_: sys.exit(7));"
+        "from bidnerf.structure.colmap import import_pycolmap; import_pycolmap('photos'); os.kill(os.getpid(), 15)"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False)
+    assert (ended.returncode, ended.stderr) == (7, b"")

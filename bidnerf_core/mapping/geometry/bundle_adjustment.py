@@ -20,6 +20,7 @@ from bidnerf_core.camera import STILL, MotionPrior, poses_of_rows
 from bidnerf_core.geometry import SE3, cauchy_loss, inlier_weight
 from bidnerf_core.mapping.geometry.triangulation import Sightings, damp, sum_by
 from bidnerf_core.mapping.resection.states import by_camera_point, by_update, pinhole
+from bidnerf_core.progress import check_cancelled
 
 SMALL_DECREASE = 1e-4
 """Relative decrease of the cost below which the iteration has converged."""
@@ -66,6 +67,7 @@ def adjust_bundle(
     state, damping = start, 1e-4
     system = linearize(sightings, state, prior, noise, correlation)
     for _ in range(30):  # about ten suffice from poses that are off by a few pixels
+        check_cancelled("bundle adjustment")
         of_images, of_points = system.step(damping)
         motion = state.motion + of_images[:, 6:] if of_images.shape[1] > 6 else state.motion
         poses = state.T_world_camera.retract(of_images[:, :6])
