@@ -75,7 +75,8 @@ class Posterior:
         # two thirds as many as another: a factor of e in the evidence adds ten. Below an evidence of 50, places are not compared, since
         # a few chance matches are no evidence against even fewer.
         log = weights + (log_odds + 10.0 * by_mode.clamp(min=50.0).log() - norm)[states.mode]
-        probability = log.nan_to_num(-torch.inf).softmax(0)
+        # Finite, so that explanations none of which is determined are equally probable.
+        probability = log.nan_to_num(-1e300, neginf=-1e300).softmax(0)
         best = int(probability.argmax())
         states, covariance = _true_cameras(states, normal, _robust_covariance(*information), scatter)
         anchor = states.T[best]
@@ -117,11 +118,18 @@ class Posterior:
         return self.states.nuisances[index, CAMERA], deviation * variance.clamp(min=0).sqrt()
 
     def mixture(self) -> Float[Tensor, "6 6"]:
-        """Return the covariance of the pose (metres, then radians) over all explanations of the most probable mode."""
+        """Return the covariance of the pose (metres, then radians) over all explanations of the most probable mode.
+
+        It is infinite if one of them does not determine the pose.
+        """
         off = self.update - self.mean
         spread = self.covariance + off[:, :, None] * off[:, None]
         own = self._own
-        return torch.where(own[:, None, None] > 1e-12, own[:, None, None] * spread, 0).sum(0)
+        return (
+            torch.where(own[:, None, None] > 1e-12, own[:, None, None] * spread, 0)
+            .sum(0)
+            .nan_to_num(torch.inf, torch.inf, torch.inf)
+        )
 
     def mass(self, distance: float, shared: Float[Tensor, "6 6"], credible: Bool[Tensor, "h"]) -> float:
         """Return the probability that the pose is right and its explanation is ``credible``.
@@ -187,7 +195,9 @@ def _robust_covariance(
     In the scaling by ``unit``, the Hessian has the Cholesky ``factor``, and the cost has the curvature ``factor curvature factor^T``. The
     covariance is infinite where ``sound`` is false.
     """
-    values, vectors = torch.linalg.eigh(curvature)
+    eye = torch.eye(P, dtype=curvature.dtype, device=curvature.device)
+    sound = sound & curvature.isfinite().all(-1).all(-1)
+    values, vectors = torch.linalg.eigh(torch.where(sound[:, None, None], curvature, eye))
     # With few matches the curvature may be indefinite; well-behaved residuals keep it near the Hessian. The curvature counts as
     # at least a fifth of the reweighted Hessian.
     basis = torch.linalg.solve_triangular(factor.mT, vectors, upper=True) / values.clamp(min=0.2)[:, None]
@@ -219,7 +229,10 @@ def _true_cameras(
     linear = torch.cat([eye, follows * (share - 1)[:, None]], -1)
     pose = linear @ covariance @ linear.mT + (follows * doubt[:, None]) @ follows.mT
     moved = states.retract(torch.cat([(follows @ step[..., None])[..., 0], step], -1))
-    return moved, (pose + pose.mT) / 2
+    pose = (pose + pose.mT) / 2
+    # Rounding may leave no covariance where the matches determine the pose only just, or not at all.
+    determined = torch.linalg.cholesky_ex(pose.nan_to_num(-1.0, -1.0, -1.0))[1] == 0
+    return moved, torch.where(determined[:, None, None], pose, torch.inf)
 
 
 def most_probable(states: States, term: Landmarks) -> States:

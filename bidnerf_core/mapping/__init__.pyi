@@ -52,6 +52,7 @@ from .landmarks.tracks import matches_of_points as matches_of_points
 from .landmarks.vocabulary import Vocabulary as Vocabulary
 from .landmarks.vocabulary import pool_views as pool_views
 from .resection.descend import CostTerm as CostTerm
+from .resection.descend import GaussianPrior as GaussianPrior
 from .resection.descend import Normal as Normal
 from .resection.descend import Quadratic as Quadratic
 from .resection.descend import damped_solution as damped_solution

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bidnerf_core.geometry import SE3, skew
 from bidnerf_core.localization import states_at
-from bidnerf_core.mapping import Normal, P, States, descend
+from bidnerf_core.mapping import GaussianPrior, Normal, P, States, descend
 
 GENERATOR = torch.Generator().manual_seed(0)
 POINTS = torch.randn((40, 3), generator=GENERATOR, dtype=torch.float64) + torch.tensor([0.0, 0, 4])
@@ -96,3 +96,23 @@ def test_what_cannot_be_solved_takes_no_step_and_harms_no_other(spoil: Callable[
     assert torch.equal(found.T[0].matrix(), starts(3).T[0].matrix())
     expected, _ = descend(starts(3), [reprojection], 20)
     torch.testing.assert_close(found.T[1:].matrix(), expected.T[1:].matrix(), rtol=0, atol=1e-5)
+
+
+def test_a_prior_on_the_pose_is_the_squared_mahalanobis_distance_with_its_derivatives() -> None:
+    root = torch.randn((6, 6), generator=GENERATOR, dtype=torch.float64)
+    given, states = GaussianPrior(SE3.exp(XI_TRUE), root @ root.T), starts(4, 0.1)
+    xi = (given.mean.inverse() @ states.T).log()
+    found = given(states)
+    torch.testing.assert_close(found.cost, (xi @ given.information * xi).sum(-1) / 2)
+    step = 1e-6 * torch.eye(P, dtype=torch.float64)
+    ahead, behind = (
+        torch.stack([given(states.retract(x.expand(4, P))).cost for x in sign * step], -1) for sign in (1, -1)
+    )
+    # The third order of the update is left out, a few thousandths of its size.
+    torch.testing.assert_close(
+        found.gradient, (ahead - behind) / 2e-6, rtol=1e-2, atol=1e-3 * float(found.gradient.abs().max())
+    )
+    fused, normal = descend(states, [given, reprojection], 20)
+    assert float(fused.T.translation.std(0).max()) < 1e-5
+    by_image = reprojection(fused).hessian
+    torch.testing.assert_close(normal.hessian[:, :6, :6], (by_image + given(fused).hessian)[:, :6, :6])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -227,3 +228,26 @@ def test_the_pose_is_that_of_the_true_camera_where_the_apparent_one_is_spurious(
     errors, spreads = zip(*depths, strict=True)
     assert errors[2] > 0.05 > errors[0]  # 2 % of the distance, about
     assert spreads == tuple(sorted(spreads))
+
+
+DEGENERATE: dict[str, Callable[[Tensor], Tensor]] = {
+    "at one place": lambda points: points[:, :1].expand_as(points),
+    "on a line": lambda points: points[:, :1] + (points[:, 1:2] - points[:, :1]) * torch.linspace(0, 1, M)[:, None],
+    "behind the camera": lambda points: 2 * TRUTH.translation - points,
+    "not a number": lambda points: points * torch.nan,
+}
+
+
+@pytest.mark.parametrize("place", DEGENERATE)
+def test_matches_that_do_not_determine_the_pose_never_leave_a_certain_one(place: str) -> None:
+    term = matches(0)
+    points = DEGENERATE[place](term.points)
+    seen = project(state(deviation()), points, term.sights).image.nan_to_num(0.0)
+    found = solved(replace(term, points=points, sights=replace(term.sights, image=seen)))
+    covariance = found.mixture()
+    assert not covariance.isnan().any()
+    if bool(covariance.isfinite().all()):
+        assert float(torch.linalg.eigvalsh(covariance)[0]) > 0
+        assert float(covariance.diagonal().max()) > 1
+    one = torch.ones(1, dtype=torch.bool)
+    assert found.mass(4.0, NOTHING, one) < 0.5

@@ -54,6 +54,25 @@ def prior(states: States) -> Normal:
     return Normal(0.5 * z.square().sum(-1), pad(z, (6, 0)), free.expand(len(z), P, P))
 
 
+@dataclass(frozen=True, eq=False)
+class GaussianPrior:
+    """A Gaussian prior on the pose: the cost is ``xi^T information xi / 2`` for the right update xi from ``mean`` to the pose."""
+
+    mean: SE3  # T_world_rig
+    information: Float[Tensor, "6 6"]  # inverse covariance; translation (metres) before rotation (radians)
+
+    def __call__(self, states: States) -> Normal:
+        xi = self.mean.update_to(states.T)
+        by_translation, by_rotation = (skew(part) for part in xi.split(3, -1))
+        adjoint = torch.cat([by_rotation, by_translation], -1)
+        adjoint = torch.cat([adjoint, pad(by_rotation, (3, 0))], -2)
+        # The derivative of xi is the inverse right Jacobian (Sola et al. 2018, eq. 179), here to the second order.
+        slope = torch.eye(6).to(xi) + adjoint / 2 + adjoint @ adjoint / 12
+        pull, rest = xi @ self.information, P - 6
+        gradient, hessian = (pull[:, None] @ slope)[:, 0], slope.mT @ self.information @ slope
+        return Normal((pull * xi).sum(-1) / 2, pad(gradient, (0, rest)), pad(hessian, (0, rest, 0, rest)))
+
+
 def total(states: States, terms: Sequence[CostTerm]) -> Normal:
     return sum((term(states) for term in terms), start=prior(states))
 
