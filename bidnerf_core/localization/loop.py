@@ -47,8 +47,16 @@ from bidnerf_core.localization.posterior import (
     settle,
     weigh,
 )
-from bidnerf_core.localization.problem import Problem
-from bidnerf_core.localization.propose import CONVINCING, LEAST_AGREEING, best_consensus, consensus, inliers
+from bidnerf_core.localization.problem import Problem, extent_of
+from bidnerf_core.localization.propose import (
+    CONVINCING,
+    LEAST_AGREEING,
+    best_consensus,
+    consensus,
+    inliers,
+    proposal_at,
+    proposals_at,
+)
 from bidnerf_core.localization.result import Outcome, Verdict, current_record
 from bidnerf_core.localization.terms.images import Images, refine_on_small_images, small_images
 from bidnerf_core.localization.terms.rays import RenderedRays
@@ -93,9 +101,8 @@ class LandmarkAnswer:
     posterior: Posterior
     explanations: Explanations
     landmarks: Landmarks
-    covariance: Float[
-        Tensor, "6 6"
-    ]  # of a right update, translation (metres) first; includes that of the map's own poses
+    # Of a right update, translation (metres) first; includes that of the map's own poses.
+    covariance: Float[Tensor, "6 6"]
     distance: float  # metres: median distance of the matched landmarks
     evidence: Evidence
     verdict: Verdict
@@ -175,8 +182,7 @@ class Loop:
     @torch.no_grad()
     def at(self, T_world_rig: SE3) -> LandmarkAnswer | None:
         """Return the answer at a pose found by other means; None if too few landmarks match there."""
-        distance = self._distance(T_world_rig)
-        proposal = Proposal("elsewhere", T_world_rig, torch.zeros(6, dtype=torch.float64), distance)
+        proposal = proposal_at("elsewhere", T_world_rig, self.landmarks)
         return self.answer(proposal, self.nearest(STRONGEST), 0.0, searched=False)
 
     def answer(self, proposal: Proposal, nearest: Nearest, nfa: float, searched: bool = True) -> LandmarkAnswer | None:
@@ -198,7 +204,7 @@ class Loop:
         return self._nearest[count]
 
     def _proposals(self) -> Iterator[tuple[Proposal, Nearest, float]]:
-        """Yield proposals, their matches and log10 false alarms: by consensus on the strongest keypoints, then on all; then the start."""
+        """Yield proposals, their matches and log10 false alarms: by consensus on the strongest keypoints, then on all; then at the start."""
         most = max(len(image.keypoints) for image in self.query.images)
         nearest, record = self.nearest(STRONGEST), current_record()
         for count in dict.fromkeys((min(STRONGEST, most), most)):
@@ -212,13 +218,7 @@ class Loop:
             if found[1] < CONVINCING:
                 break
         if self.problem is not None and (T := self.problem.start) is not None:
-            yield Proposal("start", T, torch.zeros(6, dtype=torch.float64), self._distance(T)), nearest, 0.0
-
-    def _distance(self, T_world_rig: SE3) -> float:
-        """Return the median distance of the landmarks in front of the camera, or of all landmarks if none is in front."""
-        local = T_world_rig.inverse().apply(self.landmarks.positions.double())
-        front = local[local[:, 2] > 0]
-        return float((front if len(front) else local).norm(dim=-1).median())
+            yield from proposals_at(self.query, self.landmarks, T, extent_of(self.problem), nearest)
 
     def _term(self, modes: Sequence[Mode], best: States) -> Landmarks:
         """Return the reprojection errors of the modes' matches, padded to equal length; ``best`` (g) are the modes' states.
@@ -440,7 +440,8 @@ class Loop:
         if self.problem is not None and (start := self.problem.start) is not None:
             # Of two places that look the same, the one nearer to the start is likelier.
             update = (start.inverse() @ quadratic.here.T).log()
-            away = update[:, :3].norm(dim=-1) + self._distance(start) * update[:, 3:].norm(dim=-1)
+            reach = proposal_at("start", start, self.landmarks).distance
+            away = update[:, :3].norm(dim=-1) + reach * update[:, 3:].norm(dim=-1)
             # In six dimensions, the density of a normal distribution of unknown width falls with the sixth power of the distance.
             log_odds = log_odds - 6.0 * away.clamp(min=1e-9).log()
         scatter = self.landmarks.calibration_scatter.double()

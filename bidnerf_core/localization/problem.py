@@ -6,6 +6,7 @@ Pivots are the points about which pose updates rotate, such as the middle of the
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol, TypeVar, runtime_checkable
@@ -57,6 +58,16 @@ class SceneMap(Protocol):
     def has_distances(self) -> bool:
         """Whether the map's images determine distances; images from one place do not."""
         ...
+
+
+def extent_of(scene: SceneMap | Problem) -> float:
+    """Return the size (metres) of what a map shows: of its surface or, without one, of its box."""
+    return math.dist(scene.bounds.lower, scene.bounds.upper) if scene.surface is None else scene.surface.extent
+
+
+def start_covariance(extent: float) -> Float[Tensor, "6 6"]:
+    """Return the covariance of a start of unknown uncertainty: errors of 3 % of the scene's ``extent`` (metres), and of 0.1 radians."""
+    return torch.tensor([0.03 * extent] * 3 + [0.1] * 3, dtype=torch.float64).square().diag()
 
 
 def unit_of(scene: SceneMap) -> LengthUnit:

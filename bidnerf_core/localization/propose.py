@@ -4,16 +4,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import poselib
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.explanations import Proposal, cameras_of_map
-from bidnerf_core.localization.matching import SAMPLE, Matches, QueryKeypoints, log10_nfa
+from bidnerf_core.localization.matching import (
+    OBLIQUE,
+    SAMPLE,
+    STRONGEST,
+    LandmarkMatcher,
+    Matches,
+    Nearest,
+    QueryKeypoints,
+    log10_nfa,
+)
+from bidnerf_core.localization.problem import start_covariance
 from bidnerf_core.mapping import LandmarkMap, States, project, rays_through
 
 CONVINCING = -20.0
@@ -102,6 +114,73 @@ def consensus(
     distance = float(T.inverse().apply(points[agreeing]).norm(dim=-1).median())
     nfa = log10_nfa(len(matches), int(agreeing.sum()), query.by_chance)
     return Proposal(name, T, camera, distance), nfa
+
+
+def landmarks_near(query: QueryKeypoints, landmarks: LandmarkMap, T: SE3, radius: float) -> Int[Tensor, "n"]:
+    """Return the landmarks in view from ``T`` up to ``radius`` pixels beyond the image: at most 4,000, those that most images show."""
+    views = []
+    for image in query.images:
+        camera = image.intrinsics
+        # Slopes of 0.5 times the size would have no margin, for a principal point off the centre.
+        slopes = 0.6 * torch.tensor([camera.width / camera.fx, camera.height / camera.fy]) + radius / image.focal
+        views.append(landmarks.in_view(T @ image.T_ref_camera, slopes, OBLIQUE)[0])
+    number = torch.cat(views).unique()
+    return number[landmarks.views[number].argsort(descending=True, stable=True)[:4_000].sort().values]
+
+
+def consensus_near(
+    query: QueryKeypoints, landmarks: LandmarkMap, T: SE3, radius: float
+) -> tuple[Proposal, Nearest, float] | None:
+    """Return the best pose by matches within ``radius`` pixels of where landmarks project from ``T``, as ``consensus`` does.
+
+    Only landmarks in view are compared, so that similar ones elsewhere make no match ambiguous. The second value is the landmarks nearest
+    to each keypoint.
+    """
+    number = landmarks_near(query, landmarks, T, radius)
+    if len(number) < 2 or len(query.view) <= SAMPLE:
+        return None
+    nearest = Nearest.of(query, LandmarkMatcher(landmarks[number]), STRONGEST)
+    nearest = replace(nearest, landmark=number[nearest.landmark])
+    camera, matches = torch.zeros(6, dtype=torch.float64), nearest.best
+    near = inliers(query, landmarks, matches, States.known(T, camera), radius / query.threshold)
+    proposed = consensus(query, landmarks, matches[near.nonzero()[:, 0]], camera, "start")
+    return None if proposed is None else (proposed[0], nearest, proposed[1])
+
+
+def proposal_at(name: str, T: SE3, landmarks: LandmarkMap) -> Proposal:
+    """Return a pose found by other means: its distance is that of the landmarks in front of it, or of all if none is in front."""
+    local = T.inverse().apply(landmarks.positions.double())
+    front = local[local[:, 2] > 0]
+    distance = float((front if len(front) else local).norm(dim=-1).median())
+    return Proposal(name, T, torch.zeros(6, dtype=torch.float64), distance)
+
+
+def proposals_at(
+    query: QueryKeypoints, landmarks: LandmarkMap, T: SE3, extent: float, nearest: Nearest
+) -> Iterator[tuple[Proposal, Nearest, float]]:
+    """Yield the best pose within the errors of a start (``extent``, in metres, is the size of the scene), and the start itself."""
+    start = proposal_at("start", T, landmarks)
+    radius = search_radius(query.camera, start_covariance(extent), start.distance)
+    proposed = None if radius is None else consensus_near(query, landmarks, T, radius)
+    if proposed is not None:
+        yield proposed
+    yield start, nearest, 0.0
+
+
+def pixel_radius(covariance: Float[Tensor, "6 6"], focal: float, distance: float) -> float:
+    """Return the standard deviation (pixels) of the projection of a point at ``distance`` (metres), given the pose's ``covariance``."""
+    translation, rotation = covariance.diagonal().split(3)
+    return focal * math.sqrt(float(translation.mean()) / distance**2 + float(rotation.mean()))
+
+
+def search_radius(camera: Intrinsics, covariance: Float[Tensor, "6 6"], distance: float) -> float | None:
+    """Return the radius (pixels) of the search for landmarks at ``distance`` (metres): three standard deviations of their projections.
+
+    Returns None if it would cover most of the image.
+    """
+    radius = 3.0 * pixel_radius(covariance, camera.fx, distance)
+    # A radius of more than 0.4 of the diagonal would cover most of the image.
+    return radius if radius <= 0.4 * math.hypot(camera.width, camera.height) else None
 
 
 def inliers(

@@ -8,6 +8,7 @@ outcome of an image without a right answer. The confidence, which was fitted to 
 from __future__ import annotations
 
 import functools
+import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -489,3 +490,15 @@ def test_the_same_seed_gives_the_same_answer_in_any_thread() -> None:
         assert torch.equal(one.T_world_camera.matrix(), other.T_world_camera.matrix())
         assert torch.equal(require(one.covariance), require(other.covariance))
         assert (one.outcome, one.reason) == (other.outcome, other.reason)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 2.0, 5.0, 10.0])
+def test_a_start_is_searched_as_far_as_its_errors_reach(monkeypatch: pytest.MonkeyPatch, degrees: float) -> None:
+    """Where the whole map has no consensus, as in a scene that looks alike everywhere."""
+    monkeypatch.setattr("bidnerf_core.localization.loop.best_consensus", lambda *_: None)
+    view, off = unseen(), torch.zeros(6, dtype=torch.float64)
+    off[3:] = math.radians(degrees) * torch.tensor([0.6, -0.64, 0.48], dtype=torch.float64)
+    off[:3] = 0.1 * degrees / 10
+    found = Localizer(textured_map())(view.frame.replace(depth=None), view.T_ref_camera.retract(off))
+    assert found.converged, found.reason
+    assert_near(found.T_world_camera, view.T_ref_camera, 0.03, 1.0)

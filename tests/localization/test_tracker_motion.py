@@ -11,9 +11,10 @@ from torch import Tensor
 
 from bidnerf import SE3
 from bidnerf_core.geometry import retract, update_between
+from bidnerf_core.localization.propose import pixel_radius
 
 # Inside: predictions and covariances of the filter, which show in no answer by themselves
-from bidnerf_core.localization.tracking.motion import LONGEST_GAP, Clock, Motion, PoseEstimate, pixel_radius
+from bidnerf_core.localization.tracking.motion import LONGEST_GAP, Clock, Motion, PoseEstimate
 
 VELOCITY = torch.tensor([0.3, -0.1, 0.2, 0.2, 0.4, -0.1], dtype=torch.float64)
 

@@ -18,12 +18,9 @@ from bidnerf_core.geometry import CORNERS_PER_INDEPENDENT, SE3, skew, update_bet
 from bidnerf_core.localization.accept import Evidence, Support, judge
 from bidnerf_core.localization.auto import within_risk
 from bidnerf_core.localization.explanations import STATED, Explanations, motion_prior
-from bidnerf_core.localization.loop import DEPTH_WIDTH
+from bidnerf_core.localization.loop import DEPTH_WIDTH, RADII
 from bidnerf_core.localization.matching import (
     CELLS,
-    OBLIQUE,
-    LandmarkMatcher,
-    Nearest,
     Projected,
     QueryKeypoints,
     cells,
@@ -31,24 +28,24 @@ from bidnerf_core.localization.matching import (
 )
 from bidnerf_core.localization.posterior import TOLERANCE, Posterior, linearize_modes, mass_within
 from bidnerf_core.localization.problem import SceneMap
-from bidnerf_core.localization.propose import LEAST_AGREEING, consensus
+from bidnerf_core.localization.propose import LEAST_AGREEING, consensus_near, landmarks_near, search_radius
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.settings import LEAST_POINTS
 from bidnerf_core.localization.terms.rays import ALONE, RenderedRays
 from bidnerf_core.localization.terms.surface import Surface
-from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, pixel_radius, symmetric_root
-from bidnerf_core.localization.tracking.points import INLIER, POINTS, Fit, Grey, Points
+from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, symmetric_root
+from bidnerf_core.localization.tracking.points import POINTS, Fit, Grey, Points
 from bidnerf_core.localization.tracking.state import TrackerState
 from bidnerf_core.mapping import (
     DEPTH,
     MOTION,
     CostTerm,
     Features,
+    GaussianPrior,
     LandmarkMap,
     N,
     Normal,
     P,
-    Quadratic,
     States,
     damped_solution,
     descend,
@@ -123,61 +120,55 @@ class Measurer:
         Landmarks tracked to this frame are used as long as there are enough; otherwise, landmarks are recognised anew around the pose
         of the tracked landmarks or around the prediction.
         """
+        measured = self._measured(frame, image, state, predicted)
+        return measured if measured is None else replace(measured, answer=within_risk(measured.answer, self.risk))
+
+    def _measured(self, frame: Frame, image: Grey | None, state: TrackerState, predicted: Motion) -> Measurement | None:
         landmarks = self.landmarks
         if landmarks is None or image is None:
-            found = self._by_surface(frame, image, state, predicted)
-            return found if found is None else replace(found, answer=within_risk(found.answer, self.risk))
+            return self._by_surface(frame, image, state, predicted)
         state = replace(state, age=state.age + 1)
-        known, fit, tracked = state.points.landmarks, None, None
+        known, fit, tracked, usable = state.points.landmarks, None, None, False
         if len(known) >= LEAST_AGREEING:
             correlation = landmarks.correlation_of(len(known))
             fit = Fit.of(known, frame.intrinsics, predicted.T_world_camera, correlation)
+            count = int(fit.is_inlier.sum())
+            # No pose counts that has fewer tracked landmarks, or that they fit hardly better than by chance.
+            usable = count >= ENOUGH_LANDMARKS and fit.is_accurate
             # Landmarks are recognised anew every 20 frames, and once fewer than half of them are left, unless many are.
-            enough = max(ENOUGH_LANDMARKS, min(0.5 * state.sought, 125))
-            if int(fit.is_inlier.sum()) >= enough and state.age < 20:
+            if usable and count >= min(0.5 * state.sought, 125) and state.age < 20:
                 tracked = self._by_landmarks(landmarks, frame, state, fit, predicted)
                 if tracked.answer.converged:
                     return tracked
         recognised = self._recognise(landmarks, frame, predicted, fit)
-        found = None if recognised is None else self._by_landmarks(landmarks, frame, state, recognised, predicted)
-        if fit is None or (found is not None and found.answer.converged):
-            return found
+        anew = None if recognised is None else self._by_landmarks(landmarks, frame, state, recognised, predicted)
+        if fit is None or not usable or (anew is not None and anew.answer.converged):
+            return anew
         tracked = tracked or self._by_landmarks(landmarks, frame, state, fit, predicted)
-        return found if found is not None and not tracked.answer.converged else tracked
+        return tracked if anew is None or tracked.answer.converged else anew
 
     def _recognise(self, known: LandmarkMap, frame: Frame, predicted: Motion, tracked: Fit | None) -> Fit | None:
         """Fit a pose to landmarks recognised around the pose of the tracked landmarks, or else around the prediction."""
         assert self.features is not None
-        camera, T, radius = frame.intrinsics, predicted.T_world_camera, search_radius(frame, predicted)
+        camera, T = frame.intrinsics, predicted.T_world_camera
+        radius = search_radius(camera, predicted.covariance, predicted.reach)
         if tracked is not None and tracked.log10_nfa <= SIGNIFICANT_NFA and tracked.is_accurate:
             T, radius = tracked.states.T[0], 0.0
         if radius is None:
             return None
-        # Slopes of 0.5 times the size would have no margin.
-        size = torch.tensor([camera.width / camera.fx, camera.height / camera.fy])
-        number, _ = known.in_view(T, 0.6 * size, OBLIQUE)
-        # Of the landmarks in view, the 4,000 that most images show are compared, regardless of where they project.
-        order = known.views[number].argsort(descending=True, stable=True)
-        number = number[order[:4_000].sort().values]
-        query, landmarks = QueryKeypoints.of([View(frame, SE3.identity())], self.features), known[number]
+        query = QueryKeypoints.of([View(frame, SE3.identity())], self.features)
         still = torch.zeros(6, dtype=torch.float64)
         # Around an accurate pose, this radius of matching by projection suffices.
-        tight = 1.5 * query.threshold
-        if radius > 2 * tight:
+        tight = RADII[1] * query.threshold
+        if radius > RADII[0] * query.threshold:
             # Matching by projection would compare a keypoint only with the few landmarks nearest to it; compare it with all in view.
-            if len(landmarks) < 2 or len(query.view) < 4:
-                return None
-            matches = Nearest.of(query, LandmarkMatcher(landmarks), len(query.view)).best
-            there = camera.project(T.inverse().apply(landmarks.positions[matches.landmark].double()))
-            distance = (there - query.keypoints.pixels[matches.keypoint]).norm(dim=-1)
-            proposed = consensus(
-                query, landmarks, matches[(distance <= radius).nonzero()[:, 0]], still
-            )  # NaN is behind
+            proposed = consensus_near(query, known, T, radius)
             if proposed is None:
                 return None
             T = proposed[0].T
-        fit = None
-        for within in (max(tight, min(radius, 2 * tight)), tight)[radius == 0 :]:
+        number, fit, seen = landmarks_near(query, known, T, radius), None, None
+        landmarks = known[number]
+        for within in (max(tight, min(radius, RADII[0] * query.threshold)), tight)[radius == 0 :]:
             seen = Projected(query, landmarks, States.known(T, still), within)
             matches = seen.matches(within)
             if len(matches) < LEAST_AGREEING:
@@ -186,6 +177,7 @@ class Measurer:
             fit = Fit.of(points, camera, T, known.correlation_of(len(points)))
             T = fit.states.T[0]
         assert fit is not None
+        assert seen is not None
         return replace(fit, keypoints=len(query.view), by_chance=len(seen.matches(tight, 4 * tight)))
 
     def _by_landmarks(
@@ -209,7 +201,7 @@ class Measurer:
         depth, factor = self._depth(frame, state, fit.points, fit.states)
         term = fit.term.weighted_for(fit.states)
         terms: list[CostTerm] = [term] if depth is None else [term, depth.fitted_noise(fit.states)]
-        # Gauss-Newton steps, each exact except for the robust weights.
+        # Gauss-Newton steps, each exact except for the robust weights, take half of the time of ``descend``.
         for number in range(rounds):
             # Depth hardly changes these weights, but a pose by few landmarks may be far off without depth.
             is_last = fit.is_recognised or number == rounds - 1
@@ -222,7 +214,7 @@ class Measurer:
             deviation[:, :4] = torch.hypot(exact, scatter)  # the camera is free
             model = linearize_modes(here, terms, given)
             mixture = Posterior.of(*model.minimum(given.about(model.here)), model, term, scatter).mixture()
-            if not bool(mixture.isfinite().all()):
+            if not bool((mixture + covariance).isfinite().all()):
                 why = Verdict(Outcome.UNDETERMINED, "the landmarks do not determine the pose")
                 return Measurement.of(predicted, predicted, why, float(here.noise), state)
             root = symmetric_root(mixture - covariance)
@@ -233,8 +225,7 @@ class Measurer:
         motion = predicted.update(PoseEstimate(here.T[0], share * covariance, shared))
         words = "" if depth is None else ", fused with depth"
         words = words if factor == 1 else f", without depth: it is {factor:.3g} times that of the landmarks"
-        state, fit = replace(state, doubt=doubt), replace(fit, states=here)
-        return self._judge(landmarks, state, fit, predicted, motion, words)
+        return self._judge(landmarks, replace(state, doubt=doubt), replace(fit, states=here), predicted, motion, words)
 
     def _depth(self, frame: Frame, state: TrackerState, points: Points, states: States) -> tuple[Surface | None, float]:
         """Return the term of the measured points, or None, and the ratio of their depth to that of the landmarks.
@@ -283,13 +274,7 @@ class Measurer:
         if fit.is_recognised:
             inliers = inliers.spread(fit.camera, POINTS)
             state = replace(state, sought=len(inliers), age=0)
-        elif verdict.accepted and not fit.is_accurate:
-            verdict = Verdict(Outcome.AMBIGUOUS, f"{verdict.reason}, hardly better than by chance")
-        elif verdict.accepted and count < ENOUGH_LANDMARKS:
-            why = f"{verdict.reason}, but the image does not confirm these few tracked ones"
-            verdict = Verdict(Outcome.TOO_FEW_MATCHES, why)
-        found = Measurement.of(predicted, motion, verdict, noise, replace(state, points=inliers), evidence)
-        return replace(found, answer=within_risk(found.answer, self.risk))
+        return Measurement.of(predicted, motion, verdict, noise, replace(state, points=inliers), evidence)
 
     def _by_surface(
         self, frame: Frame, image: Grey | None, state: TrackerState, predicted: Motion
@@ -309,9 +294,7 @@ class Measurer:
             why = "no colours were recorded, and the prediction is too uncertain for the shape"
             return Measurement.of(predicted, predicted, Verdict(Outcome.UNDETERMINED, why), 1.0, state)
         states = States.known(predicted.T_world_camera, torch.zeros(6, dtype=torch.float64))
-        zero, hessian = torch.zeros((1, P), dtype=torch.float64), torch.zeros((1, P, P), dtype=torch.float64)
-        hessian[0, :6, :6] = torch.linalg.inv(covariance)
-        prediction = Quadratic(states, zero[:, 0], zero, hessian)
+        prediction = GaussianPrior(predicted.T_world_camera, torch.linalg.inv(covariance))
         if points is None:
             # In a map without landmarks, 256 rays are rendered for a frame. The start is close, so that few steps suffice.
             rays = RenderedRays.of(views, self.scene.field, self.scene.bounds, 256, state.frames)
@@ -334,7 +317,8 @@ class Measurer:
             share, colours = float(near.mean()), None if image is None else float((near * alike).mean())
             measured = Support({"on_surface": share, "colour_inliers": colours})
             words = f"{share:.0%} of the measured points lie on the surface"
-        motion = predicted.refine(states.T[0].polished(), normal.hessian[0, :6, :6] - hessian[0, :6, :6])
+        information = (normal - prediction(states)).hessian[0, :6, :6]
+        motion = predicted.refine(states.T[0].polished(), information)
         deviation = _position_deviation(motion.covariance)
         moved = update_between(predicted.T_world_camera, motion.T_world_camera)
         typical = 0.0 if self.landmarks is None else self.landmarks.trial.translation
@@ -367,14 +351,6 @@ class Measurer:
             return None
         relative = (relative + relative.T) / 2
         return motion.move(fit.states.T[0], relative, seconds), corners[fit.is_inlier]
-
-
-def search_radius(frame: Frame, predicted: Motion) -> float | None:
-    """Return the radius (pixels) of the search for landmarks around their projections; None if it would cover most of the image."""
-    camera = frame.intrinsics
-    radius = INLIER * pixel_radius(predicted.covariance, camera.fx, predicted.reach)
-    # A radius of more than 0.4 of the diagonal would cover most of the image.
-    return radius if radius <= 0.4 * math.hypot(camera.width, camera.height) else None
 
 
 def shows_shape(frame: Frame) -> bool:

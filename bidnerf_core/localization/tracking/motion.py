@@ -200,12 +200,6 @@ class Motion:
         return replace(self, T_world_camera=T_world_camera, velocity=step / seconds, noise=_symmetric(noise), bias=bias)
 
 
-def pixel_radius(covariance: Float[Tensor, "6 6"], focal: float, distance: float) -> float:
-    """Return the standard deviation (pixels) of the projection of a point at ``distance`` (metres), given the pose's ``covariance``."""
-    translation, rotation = covariance.diagonal().split(3)
-    return focal * math.sqrt(float(translation.mean()) / distance**2 + float(rotation.mean()))
-
-
 def _diagonal(translation: float, rotation: float) -> Float[Tensor, "6 6"]:
     return torch.diag(torch.tensor([translation] * 3 + [rotation] * 3, dtype=torch.float64) ** 2)
 

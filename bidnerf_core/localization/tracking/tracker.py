@@ -16,10 +16,11 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.auto import localize_by_landmarks, within_risk
 from bidnerf_core.localization.by_surface import is_blank
 from bidnerf_core.localization.localizer import NO_DISTANCES, Localizer, Start, start_pose
-from bidnerf_core.localization.problem import SceneMap, origin_of, unit_of
+from bidnerf_core.localization.problem import SceneMap, extent_of, origin_of, start_covariance, unit_of
+from bidnerf_core.localization.propose import search_radius
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.settings import TrackerConfig
-from bidnerf_core.localization.tracking.measuring import Measurement, Measurer, search_radius, shows_shape
+from bidnerf_core.localization.tracking.measuring import Measurement, Measurer, shows_shape
 from bidnerf_core.localization.tracking.motion import Clock, Motion, PoseEstimate
 from bidnerf_core.localization.tracking.points import POINTS, Grey, Points
 from bidnerf_core.localization.tracking.state import (
@@ -65,9 +66,7 @@ class Tracker:
         features = None if matcher is None else limit_features(matcher.features, 600)
         self._risk = getattr(localizer.config, "risk", None)
         self._measure = Measurer(self._scene, self._landmarks, features, localizer.depth_sensor, self._risk)
-        surface, bounds = self._scene.surface, self._scene.bounds
-        corners = torch.tensor([bounds.lower, bounds.upper])
-        self._extent = float((corners[1] - corners[0]).norm()) if surface is None else surface.extent
+        self._extent = extent_of(self._scene)
 
     @property
     def tracking(self) -> bool:
@@ -139,7 +138,7 @@ class Tracker:
             if image is None and measured is not None:  # the shape still corrects some directions
                 return measured.answer, replace(state, motion=measured.motion, lost=state.lost + 1)
         found = None
-        if state.motion is None or predicted is None or state.lost or search_radius(frame, predicted) is None:
+        if state.motion is None or predicted is None or state.lost or not self._is_near(frame, predicted):
             found = self._relocalize(frame, image, state, predicted)
         if image is not None and found is not None and found.converged:
             return self._begin_at(stated, image, state, found)
@@ -164,10 +163,13 @@ class Tracker:
         why = replace(why, reason=f"lost for {amount(state.lost, 'frame')}, bridged by {how}: {why.reason}")
         return Measurement.of(predicted, predicted, why, 1.0, state).answer, state
 
+    def _is_near(self, frame: Frame, predicted: Motion) -> bool:
+        """Return whether a prediction is certain enough for a search around it."""
+        return search_radius(frame.intrinsics, predicted.covariance, predicted.reach) is not None
+
     def _at(self, frame: Frame, T: SE3, covariance: torch.Tensor | None) -> Motion:
         """Return the motion of a camera at a pose with unknown velocity; without a ``covariance``, the pose is as uncertain as a start."""
-        # A start of unknown uncertainty has errors of 3 % of the scene's extent, and of 0.1 radians.
-        usual = torch.tensor([0.03 * self._extent] * 3 + [0.1] * 3, dtype=torch.float64).square().diag()
+        usual = start_covariance(self._extent)
         noise, bias = (usual, 0 * usual) if covariance is None else (covariance / 2, covariance / 2)
         return Motion.at(PoseEstimate(T, noise, bias), self._reach(frame))
 
