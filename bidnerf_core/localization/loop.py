@@ -2,8 +2,7 @@
 
 ``docs/methods.md#code`` lists which module does which step. A further kind of measurement becomes a term in ``Loop._fused``; it affects the
 choice between places only through the log odds in ``Loop._posterior``. Anything else that the image may be, such as a mirror image of the
-scene, becomes a mode in ``Loop._other_modes``, and its outcome is chosen in ``Loop._judged``. The minimal solvers are called in
-``propose.consensus``.
+scene, becomes a mode in ``Loop._other_modes``, and its outcome is chosen in ``Loop._judged``. ``propose`` has the proposals.
 """
 
 from __future__ import annotations
