@@ -41,11 +41,11 @@ LANDMARK_KINDS = {
     "cones": TensorKind("n", least=0, most=math.pi + 1e-6),
     "sizes": TensorKind("n", least=0, most=LARGEST_LENGTH),
     "views": TensorKind("n", torch.int32, least=1),
-    "noise": TensorKind("", torch.float64, least=TINY),
+    "noise": TensorKind("", torch.float64, least=TINY, most=1e6),
     "pose_covariance": TensorKind("6 6", torch.float64),
-    "correlation": TensorKind("", torch.float64, least=TINY),
+    "correlation": TensorKind("", torch.float64, least=TINY, most=1e9),
     "usual_matches": TensorKind("", torch.float64, least=0),
-    "calibration_scatter": TensorKind("4", torch.float64, least=TINY),
+    "calibration_scatter": TensorKind("4", torch.float64, least=TINY, most=1e6),
     "trial": TensorKind("t", torch.float64),  # the fields of ``HeldOutTrial`` in order; earlier versions stored fewer
     "moving": TensorKind("", torch.float64, least=0, most=1),
 }

@@ -91,6 +91,7 @@ BROKEN_LANDMARKS: list[tuple[str, Callable[[Tensor], Tensor], str]] = [
     ("noise", torch.zeros_like, "noise is 0"),
     ("usual_matches", lambda v: v - 1, "usual_matches is -1"),
     ("moving", lambda v: v + 1.5, "moving is 1.5"),
+    ("calibration_scatter", lambda v: v + 1e30, "calibration_scatter is 1e\\+30"),
     ("pose_covariance", lambda v: v - torch.eye(6), "positive semidefinite"),
     ("pose_covariance", lambda v: v + torch.arange(6.0), "symmetric"),
 ]
