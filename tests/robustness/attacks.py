@@ -325,20 +325,7 @@ def served(folder: Path, site: Path) -> Iterator[tuple[int, subprocess.Popen[byt
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: geopose-attacked\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text("[bidnerf.services]\ngeopose = bidnerf_geopose.protocol:GEOPOSE\n")
     path = os.pathsep.join([str(site), str(plugin), os.environ.get("PYTHONPATH", "")])
-    words = [
-        "serve",
-        str(folder),
-        "--port",
-        "0",
-        "--workers",
-        "1",
-        "--timeout",
-        "20",
-        "--method",
-        "bid",
-        "--max-steps",
-        "2",
-    ]
+    words = ["serve", str(folder), "--port", "0", "--workers", "1", "--timeout", "20"]
     with (site / "log").open("wb") as log:
         process = subprocess.Popen(
             [sys.executable, "-c", "import sys; from bidnerf.cli import main; sys.exit(main())", *words],
