@@ -89,6 +89,7 @@ class MapRow(Summary):
             **rates,
             "median error": f"{_number(self.translation, 4)} {symbol(self.unit)}",
             "median error, deg": _number(self.rotation_deg, 2),
+            "CPU s a trial": _number(self.cpu_seconds, 2),
             "s a trial": f"{self.seconds:.2f}",
             "steps": f"{self.steps:g}",
             "steps to success": _number(usual.steps, 0),
@@ -136,7 +137,8 @@ class Comparison:
             *([n, *(cells[n] for cells in columns)] for n in names),
         ]
         usual = RELATIVE if self.rows[0].success[RELATIVE] else ABSOLUTE
-        note = f"success: number and Wilson's 95 % interval; to success: median of the trials that met {usual}"
+        note = f"success: number and Wilson's 95 % interval; to success: median of the trials that met {usual};"
+        note += " times are those of a clock except CPU s, which other processes do not lengthen"
         return "\n".join([printable(self.title), align_cells(lines), note])
 
     def save(self, path: str | Path) -> None:

@@ -70,7 +70,9 @@ QUANTITIES = {
     "rotation_deg": Quantity(
         "rotation error (degrees)", "trials (%)", 5.0, lambda r, _: r.error.rotation_deg if r.error else NEVER
     ),
-    "seconds": Quantity("time (s)", "right trials (%)", None, lambda r, _: r.seconds if is_right(r) else NEVER),
+    "seconds": Quantity(
+        "time by the clock (s)", "right trials (%)", None, lambda r, _: r.seconds if is_right(r) else NEVER
+    ),
     "steps": Quantity(
         "step",
         "successful trials (%)",
@@ -91,14 +93,13 @@ Figure = tuple[Path, str]
 class Figures:
     """Draws figures of ``groups`` and saves them as PNG and SVG in ``folder``. Raises ``InputError`` without matplotlib.
 
-    ``criterion`` defines success by step. If there are trials without faults, only these are drawn, in at most ``MOST_SITUATIONS``
-    situations.
+    ``criterion`` defines success by step. At most ``MOST_SITUATIONS`` situations are drawn; if there are more, first those without faults.
     """
 
     def __init__(self, groups: Sequence[ResultGroup], folder: Path, criterion: str) -> None:
         require_matplotlib()
         self.folder, self.criterion = folder, criterion
-        self.groups = [g for g in groups if g.situation.fault == NO_FAULT] or list(groups)
+        self.groups = sorted(groups, key=lambda group: group.situation.fault != NO_FAULT)
         labels = dict.fromkeys(group.label for group in groups)
         self.looks = {label: line_style(number) for number, label in enumerate(labels)}
 
@@ -252,7 +253,7 @@ def comparison_figure(folder: Path, comparison: Comparison) -> Path:
         axes.margins(x=0.25)
 
     costs = {
-        "s a trial": [row.seconds for row in comparison.rows],
+        "CPU s a trial": [row.cpu_seconds or 0.0 for row in comparison.rows],
         "peak memory, MiB": [row.peak_memory_bytes / 2**20 for row in comparison.rows],
         "map, MiB": [row.map_bytes / 2**20 for row in comparison.rows],
     }

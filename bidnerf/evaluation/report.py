@@ -26,12 +26,14 @@ from bidnerf.evaluation.summary import (
     are_stepwise,
     is_right,
     situations,
+    unit_of_results,
 )
 from bidnerf.evaluation.trial import TrialResult, open_data, trial_views
 from bidnerf.results import CRITERIA, CRITERION_NAMES, as_picture, require_matplotlib
 from bidnerf.scenes import is_closed_form
 from bidnerf_core.datasets import Capture, DatasetOptions
 from bidnerf_core.errors import InputError, printable
+from bidnerf_core.geometry import symbol
 from bidnerf_core.io import is_temporary, output_folder, write_file
 
 MARK = '<meta name="generator" content="bidnerf report">'
@@ -114,13 +116,16 @@ def render_page(
     source = files(__package__).joinpath("report.html.jinja").read_text(encoding="utf-8")
     template = environment.from_string(source.strip() + "\n")
     groups = table.groups
-    maps = (f"{s.map} ({s.weights.partition('.')[0]}) on {s.data}/{s.split}" for s in situations(groups))
+    maps = (f"{s.map} ({s.weights.partition('.')[0]}), on {s.data}/{s.split}" for s in situations(groups))
+    unit = symbol(unit_of_results(table.rows))
     return template.render(
         mark=Markup(MARK),
         title=title,
         trials=len(table.rows),
         maps=list(dict.fromkeys(maps)),
-        criteria={n: CRITERION_NAMES[n] for n in CRITERIA if any(applies(n, g.results) for g in groups)},
+        criteria={
+            n: CRITERION_NAMES[n].replace("units", unit) for n in CRITERIA if any(applies(n, g.results) for g in groups)
+        },
         sections=[(title, list(own)) for title, own in groupby(groups, attrgetter("title"))],
         pooled=any(g.situation.size is None for g in groups),
         stepwise=any(are_stepwise(group.results) for group in groups),

@@ -142,7 +142,13 @@ def _parse(path: Path, content: bytes) -> tuple[list[TrialResult], int]:
                 break
             raise
         if plain is not None:
-            results.append(read_result(plain, where))
+            try:
+                results.append(read_result(plain, where))
+            except InputError as error:
+                if (writer := _newer_writer(path)) is None:
+                    raise
+                mine = f"results of bidnerf {version('bidnerf')} or earlier; these were written by bidnerf {writer}"
+                raise InputError(error.found, where=error.where, expected=mine) from error
         length += len(line) + (number < len(lines))
     return results, length
 
@@ -292,6 +298,17 @@ def note_run(results: Path, run: Provenance) -> None:
     """Append a run to the list next to a results file, which may take several runs to complete."""
     runs = [*read_runs(results), run]
     write_file(results.with_suffix(RUNS), (json.dumps({"runs": to_plain(runs)}, indent=1) + "\n").encode())
+
+
+def _newer_writer(results: Path) -> str | None:
+    """Return the version of bidnerf that wrote a results file, if it is newer than this one and recorded next to the file."""
+    with suppress(InputError, KeyError, TypeError):  # no record of the runs, or another one
+        for run in read_record(results.with_suffix(RUNS)).items("runs") or ():
+            written = str(run["versions"]["bidnerf"])
+            numbers = [[int(part) for part in re.findall(r"\d+", each)] for each in (written, version("bidnerf"))]
+            if numbers[0] > numbers[1]:
+                return written
+    return None
 
 
 def read_runs(results: Path) -> list[Provenance]:

@@ -1,7 +1,7 @@
 """One trial: localize a frame from a start with a method, and measure the result.
 
 ``run_trial`` depends only on its arguments and the files that these name, so trials may run in any order, in any process
-and on any machine; two runs of the same trial differ only in ``seconds`` and ``peak_memory_bytes``.
+and on any machine; two runs of the same trial differ only in ``seconds``, ``cpu_seconds`` and ``peak_memory_bytes``.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import json
 import math
 import os
 import sys
+import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -110,6 +111,7 @@ class TrialResult:
     confidence: float | None = None  # probability that the pose is right; None if unknown
     unit: LengthUnit = "units"  # of all lengths: that of the map
     inputs: InputDigests | None = None  # None in results of earlier versions
+    cpu_seconds: float | None = None  # of the process; unlike ``seconds``, other processes do not lengthen it
 
     def plain(self) -> dict[str, Any]:
         """Return the result as an object of strict JSON, in which the trial has flat names; ``read_result`` reads it."""
@@ -143,7 +145,9 @@ def run_trial(trial: Trial, scene: Scene | None = None, registered: Sequence[tup
         localizer = Localizer(stored, trial.method, settings, warm_up=False)
         inputs = InputDigests(views_digest(views), stored.info.surface)
         reset_peak_memory()
+        began = time.process_time()
         answer = localizer(views, start, seed=trial.seed)
+        cpu_seconds = time.process_time() - began
     trace, error = (pose_error(poses, truth) for poses in (answer.poses, answer.T_world_camera))
     more = {
         "frame": trial.frame,
@@ -158,6 +162,7 @@ def run_trial(trial: Trial, scene: Scene | None = None, registered: Sequence[tup
         "weights": stored.training,
         "trial": to_flat(trial.portable),
         "inputs": to_plain(inputs),
+        "cpu_seconds": cpu_seconds,
     }
     return read_result(plain_localization(answer, stored.info.backend, error) | more, "result")
 

@@ -3,9 +3,6 @@ from .contract import BackendContract as BackendContract
 from .contracts import FaultContract as FaultContract
 from .contracts import FeaturesContract as FeaturesContract
 from .contracts import MethodContract as MethodContract
-from .device import DEVICE as DEVICE
-from .device import DeviceFault as DeviceFault
-from .device import Elsewhere as Elsewhere
 from .field_checks import check_background as check_background
 from .field_checks import check_hits as check_hits
 from .field_checks import check_intervals as check_intervals

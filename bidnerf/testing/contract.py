@@ -12,7 +12,6 @@ import torch
 from torch import Tensor, nn
 
 from bidnerf.testing import field_checks, recipes
-from bidnerf.testing.device import check_steps
 from bidnerf.testing.faults import calling, is_one_line, once, query, require
 from bidnerf.testing.scene import SCENE_BOUNDS, awkward_rays, join_rays, points, rgb_views, rgbd_views
 from bidnerf_core.backend import Backend, load_backend
@@ -151,9 +150,6 @@ class BackendContract:
     def test_rendering_carries_gradients_to_the_pose(self) -> None:
         for level in levels(self._trained()):
             field_checks.check_pose_gradient(*precise(level))
-
-    def test_steps_stay_on_the_device(self) -> None:
-        check_steps(self._trained())
 
     # Storage.
 

@@ -169,7 +169,7 @@ def pose_sentences(cameras: Sequence[StoredCamera], refinement: PoseRefinement) 
     moved = sorted(moved_cameras(cameras), key=lambda m: m.pixels, reverse=True)
     wrong = [m for m in moved if m.name in refinement.replaced]
     motions = torch.tensor([camera.motion for camera in cameras if camera.motion], dtype=torch.float64)
-    cause = "errors of the given poses" + (" and camera motion during readout" if len(motions) else "")
+    cause = "errors of the poses" + (" and camera motion during readout" if len(motions) else "")
     result = "the other poses are kept" if wrong else "the poses are kept"
     if refinement.refined and moved:
         metres, degrees, pixels = (
@@ -179,7 +179,7 @@ def pose_sentences(cameras: Sequence[StoredCamera], refinement: PoseRefinement) 
             f"the poses are refined by {metres:.3g} and {degrees:.2g}° or {pixels:.1f} px (median), most for {moved[0]}"
         )
     lines = [
-        f"{cause} add {refinement.inconsistency:.2f} px to the {refinement.noise_after:.2f} px of keypoints; {result}"
+        f"{cause} add {refinement.inconsistency:.2f} px to the {refinement.noise_after:.2f} px by which keypoints scatter; {result}"
     ]
     if len(motions):
         metres, radians = (median(part.norm(dim=-1).tolist()) for part in motions.split(3, dim=-1))

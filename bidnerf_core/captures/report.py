@@ -149,8 +149,7 @@ def sentences(report: CaptureReport) -> list[str]:
     if covered.arrangement == "inside":
         heights = f", looking {low:.0f}° to {high:.0f}° up"
     landmarks = (
-        f"{covered.landmarks} triangulated landmarks, typically seen in {covered.seen_by:.0f}"
-        f" photos within {covered.seen_within_deg:.0f}°"
+        f"{covered.landmarks} landmarks in several photos, typically {covered.seen_by:.0f} within {covered.seen_within_deg:.0f}°"
         if covered.landmarks
         else "no landmark seen by several of them could be triangulated"
     )
@@ -159,8 +158,8 @@ def sentences(report: CaptureReport) -> list[str]:
         (True, f"{photos}, {ARRANGEMENTS[covered.arrangement]}{heights}; {landmarks}"),
         (
             trial.images > 0,
-            f"with the landmarks of the others alone, {trial.found} of {amount(trial.images, 'photo')} of the map"
-            f" {'was' if trial.found == 1 else 'were'} localized{errors}; expect similar results for new photos taken the same way",
+            f"from the landmarks of the others alone, without field or depth, {trial.found} of {amount(trial.images, 'photo')} of the"
+            f" map {'was' if trial.found == 1 else 'were'} localized{errors}; expect this or better for new photos taken the same way",
         ),
         (
             covered.arrangement == "one place",

@@ -24,6 +24,7 @@ from bidnerf_core.fields import FieldValues, Rays, RaySamples, query_samples, re
 from bidnerf_core.frames import View
 from bidnerf_core.training import RayBank, TrainingBatch
 from optional import require
+from simulated_device import StaysOnDevice
 from tiny import black_batch
 
 SMALL = AdaNerfConfig(
@@ -44,7 +45,7 @@ SMALL = AdaNerfConfig(
 )
 
 
-class TestAdaNerf(BackendContract):
+class TestAdaNerf(StaysOnDevice, BackendContract):
     backend = backend
     config = replace(SMALL, samples_per_step=2048)
 

@@ -28,6 +28,7 @@ from bidnerf_core.training import RayBank, Supervision, ray_termination, supervi
 from bidnerf_vanilla import VanillaConfig, VanillaField, backend
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig
 from bidnerf_vanilla.recipe import step_outcome
+from simulated_device import StaysOnDevice
 
 SMALL = VanillaConfig(
     layers=3,
@@ -45,7 +46,7 @@ SMALL = VanillaConfig(
 )
 
 
-class TestVanilla(BackendContract):
+class TestVanilla(StaysOnDevice, BackendContract):
     backend = backend
     config = replace(SMALL, samples_per_step=1024)
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from bidnerf.evaluation import (
     Comparison,
     ResultTable,
+    Trial,
     TrialResult,
     note_run,
     read_runs,
@@ -20,6 +21,8 @@ from bidnerf.evaluation import (
 from bidnerf.evaluation.results import Provenance
 from bidnerf_core.io import from_plain
 from drawn import record
+from refusals import refused
+from trial_results import trial_result
 
 
 @given(results=st.lists(record(TrialResult), max_size=2, unique_by=lambda result: result.weights))
@@ -34,6 +37,19 @@ def test_any_results_come_back_as_they_were(results: list[TrialResult], tmp_path
 def test_any_comparison_comes_back_as_it_was(compared: Comparison, tmp_path: Path) -> None:
     compared.save(tmp_path / "c.json")
     assert from_plain(Comparison, json.loads((tmp_path / "c.json").read_text()), "c.json") == compared
+
+
+def test_results_of_a_newer_version_name_it(tmp_path: Path) -> None:
+    row = trial_result(Trial("house", "photos", ("a",)), [1.0]).plain()
+    (tmp_path / "r.jsonl").write_text(json.dumps(row | {"ink": 1}) + "\n")
+    for versions, expected in (
+        ({"bidnerf": "99.1"}, "these were written by bidnerf 99.1"),
+        ({"bidnerf": "0.0.1"}, "any of"),
+        ({}, "any of"),
+    ):
+        (tmp_path / "r.meta.json").write_text(json.dumps({"runs": [{"versions": versions}]}))
+        with refused(where=tmp_path / "r.jsonl", found="no field 'ink'", expected=expected):
+            ResultTable.load(tmp_path / "r.jsonl")
 
 
 @given(run=record(Provenance))

@@ -14,7 +14,6 @@ import torch
 from PIL import Image
 
 import tiny
-from bidnerf.testing import DEVICE, Elsewhere
 from bidnerf_core.camera import CameraBatch, Intrinsics, check_side
 from bidnerf_core.datasets import DatasetOptions, open_dataset
 from bidnerf_core.errors import InputError
@@ -37,6 +36,7 @@ from bidnerf_core.maps import views as views_of_map
 from bidnerf_core.training import RayBank, excess, nearby_photos, ray_bank
 from optional import require
 from photo_files import noise
+from simulated_device import DEVICE, Elsewhere
 
 CAMERA = Intrinsics(30.0, 31.0, 12.3, 8.1, 24, 16)
 LENS = replace(CAMERA, distortion=(0.1, -0.02, 0.003, 0.001))

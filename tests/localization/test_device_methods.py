@@ -14,12 +14,13 @@ import baked
 import module_fields
 from bidnerf import SE3, Frame, Localization, Localizer, Tracker
 from bidnerf.results import pose_error
-from bidnerf.testing import DEVICE, Elsewhere, MapWithLandmarks, textured_map, unseen
+from bidnerf.testing import MapWithLandmarks, textured_map, unseen
 from bidnerf_core.localization import AutoConfig, settings_of
 from flights import INTERVAL, flight_frame, flight_pose
 from localizations import without_depth
 from module_fields import AsModule
 from problems import FieldMap
+from simulated_device import DEVICE, Elsewhere
 
 SETTINGS = {
     "points": 400,

@@ -21,7 +21,7 @@ import torch
 import bidnerf as bn
 import tiny
 from bidnerf import Cancelled, InputError, Localization, Localizer, View
-from bidnerf.testing import DEVICE, Elsewhere, textured_map, training_views, unseen
+from bidnerf.testing import textured_map, training_views, unseen
 from bidnerf_core.geometry import SE3, perturb
 from bidnerf_core.localization import METHODS, AutoConfig, settings_of
 from bidnerf_core.progress import Progress, job_context
@@ -30,6 +30,7 @@ from blob_images import BOUNDS, FIELD, FRAME, POSES, TRUTH, photograph
 from conditions import NOT_RENDERED
 from problems import FieldMap
 from refusals import refused
+from simulated_device import DEVICE, Elsewhere
 
 MAP = FieldMap(FIELD, BOUNDS)
 START = perturb(TRUTH, 0.1, 3.0, seed=2)

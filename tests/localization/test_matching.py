@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bidnerf import SE3, Frame, Intrinsics, View
-from bidnerf.testing import DEVICE, Elsewhere, unseen
+from bidnerf.testing import unseen
 from bidnerf_core.devices import move_to
 from bidnerf_core.localization import LandmarkMatcher
 
@@ -25,6 +25,7 @@ from bidnerf_core.mapping import LandmarkMap, Sift, States, build_landmarks, squ
 from conditions import COPY, PINHOLE, point_landmarks, point_view, points, twice
 from landmark_scene import Points, looking_in, ring
 from refusals import refused
+from simulated_device import DEVICE, Elsewhere
 
 TRUE = looking_in(0.43, 0.45, 3.6)
 NO_CORRECTION = torch.zeros(6, dtype=torch.float64)

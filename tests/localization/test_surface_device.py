@@ -13,7 +13,6 @@ from torch import Generator, Tensor
 
 import baked
 import module_fields
-from bidnerf.testing import DEVICE, Elsewhere
 from bidnerf_core.devices import move_to, without_waiting
 from bidnerf_core.fields import RadianceField
 from bidnerf_core.frames import View
@@ -22,6 +21,7 @@ from bidnerf_core.localization import ColourSettings, DepthLossSettings, Images,
 from bidnerf_core.localization.terms.images import Thumbnail, surface_renderer
 from bidnerf_core.mapping import CostTerm, SurfaceMap, cast, descend, trace
 from problems import FieldMap
+from simulated_device import DEVICE, Elsewhere
 
 
 @dataclass(frozen=True)

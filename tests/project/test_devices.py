@@ -16,7 +16,7 @@ import module_fields
 import tiny
 from bidnerf import Localizer, Map
 from bidnerf.scenes import HomogeneousBall
-from bidnerf.testing import DEVICE, Elsewhere, textured_map
+from bidnerf.testing import textured_map
 from bidnerf_core.backend import load_backend
 from bidnerf_core.devices import Resident, may_wait, move_to, run_on
 from bidnerf_core.io import to_plain
@@ -26,6 +26,7 @@ from bidnerf_core.maps import MapInfo
 from optional import require
 from problems import FieldMap
 from refusals import refused
+from simulated_device import DEVICE, Elsewhere
 
 CPU = torch.device("cpu")
 QUICK = AutoConfig(points=400, hypotheses=48, rounds=1, refine_steps=2, refine_rays=64, fused_rays=64)

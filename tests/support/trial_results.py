@@ -40,4 +40,4 @@ def trial_result(trial: Trial, distances: Sequence[float], angles: Sequence[floa
 
 def timeless(rows: Iterable[TrialResult]) -> list[TrialResult]:
     """Return results without the values in which two runs differ."""
-    return [replace(row, seconds=0.0, peak_memory_bytes=0) for row in rows]
+    return [replace(row, seconds=0.0, cpu_seconds=None, peak_memory_bytes=0) for row in rows]

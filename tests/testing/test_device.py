@@ -8,14 +8,11 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from bidnerf.testing import DEVICE, DeviceFault, Elsewhere
 from bidnerf.testing import SCENE_BOUNDS as BOUNDS
-
-# Inside: the check of single steps, into which faults are planted
-from bidnerf.testing.device import check_steps
 from bidnerf_core.devices import may_wait, without_waiting
 from bidnerf_core.fields import FieldValues, RaySampler, SceneBounds, Stratified
 from bidnerf_core.geometry import SE3
+from simulated_device import DEVICE, DeviceFault, Elsewhere, check_steps
 
 FORBIDDEN: dict[str, Callable[[Tensor], object]] = {
     "cpu": lambda x: x.cpu(),

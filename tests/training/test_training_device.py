@@ -13,7 +13,6 @@ import pytest
 import torch
 
 import tiny
-from bidnerf.testing import DEVICE, Elsewhere
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.devices import move_to
 from bidnerf_core.fields import RaySamples, query_packed, query_samples
@@ -22,6 +21,7 @@ from bidnerf_core.training import RayBank, TrainingStopped, ray_bank
 
 # Inside: steps without room for their samples
 from bidnerf_hashgrid import recipe
+from simulated_device import DEVICE, Elsewhere
 from test_supervision import BACKENDS, seen
 from test_training import Kept
 

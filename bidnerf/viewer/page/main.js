@@ -107,13 +107,14 @@ class Page {
       : this.track || this.results ? [] : [element("p", { class: "empty" }, "The page holds no localization.")]));
   }
 
-  // Images of the map, spread over all, from whose cameras one can look.
-  gallery() {
+  // Images of the map, spread over all or, at a click, all of them, from whose cameras one can look.
+  gallery(most = GALLERY) {
     const known = this.map.cameras.map((camera, i) => [camera, i, camera.thumbnail?.url ?? this.live?.thumbnail(i)]).filter(([, , url]) => url);
-    const every = Math.max(1, Math.ceil(known.length / GALLERY));
+    const every = Math.max(1, Math.ceil(known.length / most));
     find("seen").hidden = !known.length;
     find("gallery").replaceChildren(...known.filter((_, i) => i % every === 0).map(([{ name }, i, url]) =>
-      element("button", { title: name, onclick: () => this.lookFrom(i) }, element("img", { src: url, alt: name, loading: "lazy" }))));
+      element("button", { title: name, onclick: () => this.lookFrom(i) }, element("img", { src: url, alt: name, loading: "lazy" }))),
+      ...(every > 1 ? [element("button", { class: "more", onclick: () => this.gallery(known.length) }, `all ${known.length}`)] : []));
   }
 
   lookFrom(number) {

@@ -25,6 +25,7 @@ export function outcomeOf(answer) {
 }
 
 export function uncertainty(answer, factor) {
+  if (!answer.pose) return [];
   if (!answer.ellipsoid) return [element("h2", {}, "Uncertainty"), element("p", { class: "empty" }, "The answer has no covariance.")];
   const { lengths, rotation_deg: turns } = answer.ellipsoid;
   const enlarged = factor > 1 ? ` It is drawn ${factor} times as large.` : "";

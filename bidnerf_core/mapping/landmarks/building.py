@@ -250,7 +250,7 @@ def track_views(
     if not views:
         raise InputError("nothing to build landmarks from:", expected="at least one view")
     pairs = likely_pairs([view.T_ref_camera for view in views], config.neighbours)
-    step = _counter("landmarks", "steps", len(views) + len(pairs))
+    step = _counter("landmarks", "images and pairs", len(views) + len(pairs))
     images = _map_in_threads(lambda view: image_keypoints(view, detector), views, step)
     lengths = sorted({image.keypoints.descriptors.shape[1] for image in images})
     if len(lengths) > 1:

@@ -24,10 +24,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from bidnerf.testing.faults import calling, require
-from bidnerf.testing.field_checks import close
-from bidnerf.testing.scene import SCENE_BOUNDS, rgbd_views
-from bidnerf.testing.textured_field import MapWithLandmarks
+from bidnerf.testing import SCENE_BOUNDS, MapWithLandmarks, rgbd_views
 from bidnerf_core import devices
 from bidnerf_core.devices import move_to, without_waiting
 from bidnerf_core.fields import RadianceField, levels
@@ -272,8 +269,7 @@ def check_steps(field: RadianceField) -> None:
         expected = _first_order(_problem(field), number, None)
         who = f"{type(field).__name__}, level {number}"
         with Elsewhere() as mode:
-            with calling(f"{type(field).__name__}.to(device)"):
-                there: Any = cast(Any, copy.deepcopy(field)).to(DEVICE)
+            there: Any = cast(Any, copy.deepcopy(field)).to(DEVICE)
             problem = _problem(there)
             if problem.device != DEVICE:
                 return
@@ -286,7 +282,14 @@ def check_steps(field: RadianceField) -> None:
                 reason = f"{fault}; expected all of it on the field's device, in shapes that are known"
                 raise AssertionError(f"{who}: {step}: {reason}") from fault
         other = "steps on another device lead to a different pose than on the CPU; is some state not moved?"
-        require(who, (close(found, expected, 1e-3), other))
+        assert torch.allclose(found, expected, rtol=0, atol=1e-3), f"{who}: {other}"
+
+
+class StaysOnDevice:
+    """A test for classes of ``BackendContract``: the steps of a localization in a trained field stay on its device."""
+
+    def test_steps_stay_on_the_device(self) -> None:
+        check_steps(cast(Any, self)._trained())
 
 
 def _problem(field: RadianceField) -> Problem:
