@@ -9,6 +9,7 @@ import bidnerf as bn
 from bidnerf.results import pose_error
 from bidnerf.scenes import closed_form_data
 from bidnerf_core.geometry import perturb
+from bidnerf_core.progress import Progress
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--backend", default="hashgrid")
@@ -18,7 +19,14 @@ given = parser.parse_args()
 
 # A scene in closed form stands in for your own images, which open_dataset("FOLDER") opens.
 data = closed_form_data("demo:object")
-scene = bn.train(data, given.backend, config={"steps": given.steps}, bake=False)  # load_map loads a stored one
+
+
+def report(progress: Progress) -> None:
+    if progress.done % 100 == 0:
+        print(f"{progress.stage}: {progress.done} of {progress.total} {progress.unit}")
+
+
+scene = bn.train(data, given.backend, config={"steps": given.steps}, bake=False, progress=report)
 
 (unseen,) = data.views("test", ["0003"])
 start = perturb(unseen.T_ref_camera, translation=0.4, rotation_deg=10, seed=0)

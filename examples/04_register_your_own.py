@@ -16,14 +16,14 @@ from bidnerf_core.backend import FieldValues, RecipeBackend, Stratified, Supervi
 @dataclass(frozen=True)
 class FogConfig(SupervisionConfig):
     seed: int = 0
-    steps: int = 80
+    steps: int = 400
 
 
 class Fog(torch.nn.Module):
     def __init__(self, config, bounds):
         super().__init__()
-        self.bounds, self.sampler = bounds, Stratified(48, bounds)
-        self.grid = torch.nn.Parameter(torch.zeros(1, 4, 32, 32, 32))
+        self.bounds, self.sampler = bounds, Stratified(64, bounds)
+        self.grid = torch.nn.Parameter(torch.zeros(1, 4, 48, 48, 48))
 
     def query(self, positions, directions):
         places = self.bounds.normalized(positions).reshape(1, -1, 1, 1, 3)  # in [-1, 1]
@@ -40,4 +40,9 @@ def recipe(field, views, config, report):
 bn.register("backends", "fog", RecipeBackend("a grid of coloured fog", FogConfig, Fog, recipe))
 scene = bn.train(data := closed_form_data("demo:object"), "fog", bake=False)
 plan = bn.Plan(protocol="bid", sizes=[0.4], method="bid", config={"max_steps": 100}, trials=1)
-print(bn.evaluate(scene, data, plan))
+print(table := bn.evaluate(scene, data, plan))
+start, error = table.rows[0].start_error, table.rows[0].error
+found = "success" if error.translation < 0.1 * start.translation else "no success"
+print(
+    f"{found}: bid began {start.translation:.2f} m away and ended {error.translation:.4f} m from the true pose, in the fog"
+)

@@ -63,7 +63,7 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], wide: str
         table.add_row(*map(printable, row))
     with screen.capture() as drawn:  # written below, since rich handles a closed pipe in its own way
         screen.print(table)
-    sys.stdout.write(drawn.get())
+    sys.stdout.write("".join(f"{line.rstrip()}\n" for line in drawn.get().splitlines()))
 
 
 # Files and folders are checked before any work, and never replace an input.

@@ -13,6 +13,7 @@ from bidnerf.evaluation import open_scene
 from bidnerf.scenes import closed_form_data, orbit
 from bidnerf_core import registry
 from bidnerf_core.fields import DEPTH_RESIDUALS
+from commands import quietly
 
 pytestmark = pytest.mark.slow
 
@@ -20,7 +21,7 @@ pytestmark = pytest.mark.slow
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
 QUICK = {"--steps": ["4"], "--descent": ["3"], "--trials": ["2"], "--backends": ["hashgrid", "vanilla"]}
 SHORTENED = {
-    "steps: int = 80": "steps: int = 4",
+    "steps: int = 400": "steps: int = 4",
     '"max_steps": 100': '"max_steps": 3',
     "processes=True": "processes=False",
 }
@@ -56,6 +57,12 @@ def test_example_runs(
     printed = capsys.readouterr().out
     assert "off by" in printed or "success" in printed
     assert "success in 0" not in printed
+
+
+def test_a_backend_of_ones_own_finds_the_pose() -> None:
+    example = next(path for path in EXAMPLES if path.name.startswith("04"))
+    done = quietly([sys.executable, str(example)])
+    assert done.splitlines()[-1].startswith("success: bid began 0.40 m away and ended 0.0")
 
 
 def test_what_is_shortened_is_there() -> None:
