@@ -196,7 +196,7 @@ def run_train(
     check_folder(out, (data,), may_be_map=True)
     require_device(target.device)
     images = replace(images, camera=_given_camera(images.camera, photos_camera))
-    photos = lacks_poses(data)
+    photos = lacks_poses(data, images)
     if photos:
         given = {"--depth-unit": images.depth_unit, "--register-depth": images.register_depth, "--masks": images.masks}
         refuse(given, f"is for a dataset, but {data} has no poses; 'bidnerf poses' makes a dataset of photos")

@@ -83,5 +83,6 @@ reader = Format(
     _find,
     _read,
     ["camera"],
+    may_lack_poses=True,
     precedence=30,  # a recording with metric poses
 )

@@ -90,5 +90,6 @@ reader = Format(
     "calib.txt with image_2 or image_0 (KITTI odometry)",
     _find,
     _read,
+    may_lack_poses=True,
     precedence=30,  # a recording with metric poses
 )

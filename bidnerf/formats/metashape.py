@@ -16,7 +16,6 @@ from xml.etree import ElementTree
 from bidnerf.formats.reality_capture import file_heads
 from bidnerf_core.camera import Camera, PanoramaFace, colmap_camera
 from bidnerf_core.datasets import (
-    IMAGE_ENDINGS,
     Capture,
     DatasetOptions,
     FileNames,
@@ -41,7 +40,7 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
     }
     metric = chunk.find("transform/scale")
     scale = 1.0 if metric is None else numbers_in(f"{file}: the scale of the chunk", metric.text or "", 1)[0]
-    names = FileNames(path, *(path / place for place in ("images", "photos", "input")))
+    names = FileNames(path, *(path / place for place in ("images", "photos", "input")), images=options.image_folder)
     listed = list(chunk.iter("camera"))
     cameras = {camera.get("label") or "": camera for camera in listed}
     if len(cameras) < len(listed):
@@ -49,7 +48,7 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
     shots = list[Shot]()
     for label in sorted(cameras, key=natural_order):
         transform, sensor = cameras[label].find("transform"), sensors.get(cameras[label].get("sensor_id"))
-        where, pose, image = f"{file}: camera {label}", None, names.path(label, IMAGE_ENDINGS)
+        where, pose, image = f"{file}: camera {label}", None, names.image(label)
         if not is_file(image):  # its sensor may never have been calibrated
             shots.append(Shot(image=image))
             continue
@@ -116,5 +115,6 @@ reader = Format(
     "photos with a .xml of a chunk's cameras (Agisoft Metashape)",
     _find,
     _read,
+    ["images"],
     precedence=10,  # its file has no name of its own, so formats with one come first
 )

@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 
 from bidnerf_core.camera import Camera, PanoramaFace, colmap_camera
 from bidnerf_core.datasets import (
-    IMAGE_ENDINGS,
     Capture,
     DatasetOptions,
     FileNames,
@@ -49,11 +48,11 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
     entries, cameras = part["shots"], part.get("cameras")
     if len(parts) > 1:
         warn_about(file, f"has {len(parts)} reconstructions, of which the one with {len(entries)} images is used")
-    others = ("images", "opensfm/images", ".", "../images")
-    names, shots = FileNames(*(path / place for place in others)), list[Shot]()
+    others = (".", "images", "opensfm/images", "../images")
+    names, shots = FileNames(*(path / place for place in others), images=options.image_folder), list[Shot]()
     known = dict[str, Camera]()
     for name in sorted(entries, key=natural_order):
-        where, entry, image = f"{file}: {name}", entries[name], names.path(name, IMAGE_ENDINGS)
+        where, entry, image = f"{file}: {name}", entries[name], names.image(name)
         if not is_file(image):
             shots.append(Shot(image=image))
             continue
@@ -115,5 +114,6 @@ reader = Format(
     "images with reconstruction.json (OpenSfM, OpenDroneMap)",
     _find,
     _read,
+    ["images"],
     precedence=13,  # after LLFF, which is made from COLMAP's reconstruction
 )

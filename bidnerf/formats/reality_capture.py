@@ -18,7 +18,6 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from bidnerf_core.datasets import (
-    IMAGE_ENDINGS,
     Capture,
     DatasetOptions,
     FileNames,
@@ -39,9 +38,9 @@ POSE_FIELDS = ("x", "y", "alt", "heading", "pitch", "roll")
 def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
     """Read the list. Raises ``InputError`` if a row is invalid."""
     columns = "the columns of the export 'Internal/External camera parameters', which has focal lengths (f)"
-    names = FileNames(path, path / "images", path / "input")
+    names = FileNames(path, path / "images", path / "input", images=options.image_folder)
     rows = read_table(file, "a list of cameras", columns, {"name", "f", *POSE_FIELDS})
-    shots = [_shot(row, values, names.path(values["name"], IMAGE_ENDINGS)) for row, values in rows]
+    shots = [_shot(row, values, names.image(values["name"])) for row, values in rows]
     shots.sort(key=lambda shot: natural_order(f"{shot.file}"))
     return Capture(path, shots, options.colour, pose_file=file)
 
@@ -88,5 +87,6 @@ reader = Format(
     "photos with a .csv of #name,x,y,alt,heading,pitch,roll,f (RealityCapture)",
     _find,
     _read,
+    ["images"],
     precedence=25,  # exported by hand, so preferred to a model of COLMAP
 )

@@ -79,5 +79,6 @@ reader = Format(
     _find,
     _read,
     ["depth_unit"],
+    may_lack_poses=True,
     precedence=30,  # a recording with metric poses
 )

@@ -35,8 +35,8 @@ def _read(path: Path, match: tuple[list[Path], Path], options: DatasetOptions) -
     images, intrinsics = match
     depth = _intrinsics(path, "depth")
     measured = {file.stem: file for file in photos_in(path / "depth")[0]} if (path / "depth").is_dir() else {}
-    camera = _camera(intrinsics, images[0])
-    own = None if depth is None or not measured else _camera(depth, next(iter(measured.values())))
+    camera = read_matrix(intrinsics, _size(images[0]))
+    own = None if depth is None or not measured else read_matrix(depth, _size(next(iter(measured.values()))))
     sensor, unit = options.sensor(path, own_sensor(camera, own)), options.depth_unit or MILLIMETRE
     read, shots = DepthReader(documented=("65535",)), list[Shot]()
     for image in images:
@@ -73,15 +73,23 @@ def _intrinsics(path: Path, kind: str) -> Path | None:
     return first_file(path, f"intrinsic/{name}", name, f"intrinsics/{name}")
 
 
-def _camera(file: Path, image: Path) -> Intrinsics:
-    """Return the camera of the images, with the size of ``image``."""
+def _size(image: Path) -> tuple[int, int]:
+    header = read_header(image)
+    return header.width, header.height
+
+
+def read_matrix(file: Path, size: tuple[int, int], first_centre: float = 0.5) -> Intrinsics:
+    """Return the camera of images of a ``size`` from a matrix (3x3 or 4x4), or from a focal length, with or without a centre."""
     expected = "a matrix of intrinsics, 3x3 or 4x4"
-    rows = [row.numbers() for row in read_rows(file, "ScanNet's intrinsics", expected)]
+    rows = [row.numbers() for row in read_rows(file, "intrinsics", expected)]
+    if rows and len(rows[0]) == 1:
+        return camera_of(file, (*rows[0], *rows[0], size[0] / 2, size[1] / 2), size, first_centre=0)
+    if rows and rows[0][1:2] != [0.0] and len(rows[0]) in (3, 4):  # NSVF's focal length and centre
+        rows = [[rows[0][0], 0, rows[0][1]], [0, rows[0][0], rows[0][2]], [0, 0, 1]]
     if len(rows) < 3 or any(len(row) < 3 for row in rows):
         raise InputError(f"has {len(rows)} rows", where=file, expected=expected)
     (fx, _, cx, *_), (_, fy, cy, *_) = rows[:2]
-    header = read_header(image)
-    return camera_of(file, (fx, fy, cx, cy), (header.width, header.height))
+    return camera_of(file, (fx, fy, cx, cy), size, first_centre=first_centre)
 
 
 reader = Format(
@@ -90,5 +98,6 @@ reader = Format(
     _find,
     _read,
     ("register_depth", "depth_unit"),
+    may_lack_poses=True,
     precedence=30,  # a recording with metric poses
 )

@@ -139,5 +139,6 @@ reader = Format(
     _find,
     _read,
     ("camera", "register_depth", "depth_unit"),
+    may_lack_poses=True,
     precedence=30,  # a recording with metric poses
 )

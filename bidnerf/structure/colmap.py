@@ -91,8 +91,11 @@ class PhotoSet:
     """The readable photos and their cameras, and the reasons why other photos cannot be read."""
 
     photos: list[ListedPhoto] = field(default_factory=list)
-    cameras: dict[int, Intrinsics] = field(default_factory=dict)  # of reduced photos, by number
-    known_focal: dict[int, bool] = field(default_factory=dict)  # whether EXIF or the user states the focal length
+    cameras: dict[int, Camera] = field(default_factory=dict)  # of reduced photos, by number
+    fixed: set[int] = field(default_factory=set)  # numbers of the cameras that the user or the recording states
+    known_focal: set[int] = field(
+        default_factory=set
+    )  # numbers of the cameras whose focal length is stated, if only in EXIF
     unusable: dict[str, str] = field(default_factory=dict)  # reasons by name
 
     def require_enough(self, source: Path) -> None:
@@ -118,25 +121,24 @@ def list_photos(images: Sequence[SourceImage], given: Camera | CameraSource | st
         except InputError as error:
             listed.unusable[image.name] = _without_file(error, image)
             continue
-        size = (header.width, header.height)
-        camera = numbers.setdefault((size, replace(exif, orientation=UPRIGHT)), len(numbers) + 1)
+        size, exif_of_lens = (header.width, header.height), replace(exif, orientation=UPRIGHT)
+        camera = numbers.setdefault((size, exif_of_lens, image.camera), len(numbers) + 1)
         photo = ListedPhoto(image, number, size, reduced_size(*size, MATCHED_SIDE), exif, camera)
         listed.photos.append(photo)
-        if camera not in listed.cameras:
-            first, listed.known_focal[camera] = _initial_camera(photo, given)
-            listed.cameras[camera] = first.resized(*photo.reduced)
+        if camera in listed.cameras:
+            continue
+        first: Camera = Intrinsics.from_focal(1.2 * max(size), *size)  # as COLMAP assumes
+        source = image.camera if given is None else given if isinstance(given, CameraSource) else CameraSource(given)
+        if source.is_given:
+            first = source.find(image.file, Raster(*size)).camera
+            listed.fixed.add(camera)
+            listed.known_focal.add(camera)
+        elif exif.has_focal_length:
+            with contextlib.suppress(InputError):  # cropped after it was taken
+                first = camera_from_exif(str(image.file), Raster(*size), exif_of_lens).intrinsics
+                listed.known_focal.add(camera)
+        listed.cameras[camera] = first.resized(*photo.reduced)
     return listed
-
-
-def _initial_camera(photo: ListedPhoto, given: Camera | CameraSource | str | Path | None) -> tuple[Intrinsics, bool]:
-    raster, exif = Raster(*photo.size), replace(photo.exif, orientation=UPRIGHT)
-    if given is not None:
-        source = given if isinstance(given, CameraSource) else CameraSource(given)
-        return source.find(photo.image.file, raster).intrinsics, True
-    if exif.has_focal_length:
-        with contextlib.suppress(InputError):  # cropped after it was taken
-            return camera_from_exif(str(photo.image.file), raster, exif).intrinsics, True
-    return Intrinsics.from_focal(1.2 * max(photo.size), *photo.size), False  # as COLMAP assumes
 
 
 def stored_name(number: int) -> str:
@@ -147,28 +149,26 @@ def stored_name(number: int) -> str:
     return f"{number:06d}"
 
 
-def to_colmap(intrinsics: Intrinsics, number: int, pycolmap: Any) -> Any:
-    """Convert intrinsics to a pycolmap camera, which uses the same pixel convention.
+def to_colmap(camera: Camera, number: int, pycolmap: Any) -> Any:
+    """Convert a camera to one of pycolmap, which uses the same pixel convention.
 
     Raises ``InputError`` for a lens without a COLMAP model.
     """
-    model, parameters = colmap_model(intrinsics)
-    return pycolmap.Camera(
-        camera_id=number, model=model, width=intrinsics.width, height=intrinsics.height, params=parameters
-    )
+    model, parameters = colmap_model(camera)
+    return pycolmap.Camera(camera_id=number, model=model, width=camera.width, height=camera.height, params=parameters)
 
 
-def write_cameras(database: Any, photos: PhotoSet, fixed: bool, pycolmap: Any) -> None:
-    """Write cameras and photos to an empty database. Cameras get one radial distortion coefficient unless ``fixed``."""
+def write_cameras(database: Any, photos: PhotoSet, pycolmap: Any) -> None:
+    """Write cameras and photos to an empty database. Cameras that are not fixed get one radial distortion coefficient."""
     with pycolmap.DatabaseTransaction(database):
-        for number, intrinsics in photos.cameras.items():
-            size = intrinsics.width, intrinsics.height
+        for number, known in photos.cameras.items():
+            size = known.width, known.height
             camera = (
-                to_colmap(intrinsics, number, pycolmap)
-                if fixed
-                else pycolmap.Camera.create_from_model_name(number, "SIMPLE_RADIAL", intrinsics.fx, *size)
+                to_colmap(known, number, pycolmap)
+                if number in photos.fixed
+                else pycolmap.Camera.create_from_model_name(number, "SIMPLE_RADIAL", known.pinhole.fx, *size)
             )
-            camera.has_prior_focal_length = photos.known_focal[number]
+            camera.has_prior_focal_length = number in photos.known_focal
             database.write_camera(camera, use_camera_id=True)
             rig = pycolmap.Rig(rig_id=number)
             rig.add_ref_sensor(camera.sensor_id)

@@ -8,7 +8,7 @@ import os
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -16,19 +16,23 @@ from scipy.spatial.transform import Rotation
 
 from bidnerf.structure.colmap import LEAST_PHOTOS, ListedPhoto, PhotoSet
 from bidnerf.structure.record import MODEL, TRANSFORMS
-from bidnerf_core.camera import Intrinsics, colmap_camera
+from bidnerf_core.camera import CentralLens, Intrinsics, Raster, colmap_camera
 from bidnerf_core.captures import up_direction
 from bidnerf_core.datasets import frame_entry
 from bidnerf_core.errors import amount
-from bidnerf_core.geometry import SE3
+from bidnerf_core.frames import fit_depth
+from bidnerf_core.geometry import SE3, LengthUnit
 from bidnerf_core.io import write_file
 from bidnerf_core.progress import counter
 
+LEAST_DEPTHS = 30
+"""Smallest number of points with measured depth that determine the scale of a model."""
 
-def reconstruct(database: Path, folder: Path, photos: PhotoSet, fixed: bool, threads: int, pycolmap: Any) -> list[Any]:
+
+def reconstruct(database: Path, folder: Path, photos: PhotoSet, threads: int, pycolmap: Any) -> list[Any]:
     """Reconstruct models from the photos in a database, write them to ``folder``, and return them, the largest first.
 
-    If ``fixed``, the cameras are constant. Photos without overlap form separate models; there may be none.
+    Fixed cameras are constant. Photos without overlap form separate models; there may be none.
     """
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=threads,
@@ -37,8 +41,8 @@ def reconstruct(database: Path, folder: Path, photos: PhotoSet, fixed: bool, thr
         min_model_size=LEAST_PHOTOS,
         max_num_models=20,
     )
-    if fixed:
-        options.constant_cameras = set(photos.cameras)
+    options.constant_cameras = photos.fixed
+    if photos.fixed == photos.cameras.keys():
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
     total, count, placed = len(photos.photos), counter("placing photos", "photos"), itertools.count(1)
@@ -149,7 +153,32 @@ def reasons_left_out(
     return reasons
 
 
-def write_dataset(folder: Path, photos: Mapping[int, ListedPhoto], model: Any, base: Path) -> None:
+def scale_to_depth(model: Any, photos: Mapping[int, ListedPhoto], pycolmap: Any) -> bool:
+    """Scale a model to metres if its photos have depth: by the median of the depth of its points, measured and in the model.
+
+    Return whether it was scaled.
+    """
+    ratios = list[float]()
+    for number in model.reg_image_ids():
+        image, photo = model.image(number), photos[number]
+        if photo.image.depth is None or photo.image.depth.sensor is not None:
+            continue
+        where = f"{photo.image.depth.path}: depth"
+        metres = fit_depth(photo.image.depth.read(), Raster(*photo.size), photo.reduced, where).numpy()
+        for point in (point for point in image.points2D if point.has_point3D()):
+            column, row = np.clip(point.xy.astype(int), 0, np.array(photo.reduced) - 1)
+            far = (image.cam_from_world() * model.point3D(point.point3D_id).xyz)[2]
+            if metres[row, column] > 0 and far > 0:
+                ratios.append(float(metres[row, column]) / far)
+    if len(ratios) < LEAST_DEPTHS:
+        return False
+    model.transform(pycolmap.Sim3d(float(np.median(ratios)), pycolmap.Rotation3d(), np.zeros(3)))
+    return True
+
+
+def write_dataset(
+    folder: Path, photos: Mapping[int, ListedPhoto], model: Any, base: Path, unit: LengthUnit | Literal["units"]
+) -> None:
     """Write a model of ``photos`` (by number) and its ``transforms.json`` to ``folder``; the model names images relative to ``base``."""
     entries = []
     for number in sorted(model.reg_image_ids()):
@@ -159,18 +188,24 @@ def write_dataset(folder: Path, photos: Mapping[int, ListedPhoto], model: Any, b
         matrix = torch.from_numpy(image.cam_from_world().matrix()).double()
         T_world_camera = SE3(matrix[:, :3].clone(), matrix[:, 3].clone()).inverse()
         path = relative_path(photo.image.file, folder)
-        entries.append(frame_entry(path, photo.image.name, camera, T_world_camera, photo.image.time))
+        entry, depth = frame_entry(path, photo.image.name, camera, T_world_camera, photo.image.time), photo.image.depth
+        if depth is not None and depth.sensor is None and isinstance(depth.path, Path) and photo.image.depth_unit:
+            entry |= {
+                "depth_file_path": relative_path(depth.path, folder),
+                "depth_unit_scale_factor": photo.image.depth_unit,
+            }
+        entries.append(entry)
     (folder / MODEL).mkdir(parents=True, exist_ok=True)
     model.write_binary(folder / MODEL)
-    content = {"camera_model": "OPENCV", "unit": "units", "frames": entries}
+    content = {"camera_model": "OPENCV", "unit": unit, "frames": entries}
     write_file(folder / TRANSFORMS, json.dumps(content, indent=1, allow_nan=False).encode())
 
 
-def from_colmap(camera: Any) -> Intrinsics:
-    """Return the intrinsics of a pycolmap camera with a perspective lens."""
-    intrinsics = colmap_camera("COLMAP", camera.model.name, camera.width, camera.height, list(camera.params))
-    assert isinstance(intrinsics, Intrinsics)
-    return intrinsics
+def from_colmap(camera: Any) -> Intrinsics | CentralLens:
+    """Return the camera of pycolmap's one, which is no panorama."""
+    found = colmap_camera("COLMAP", camera.model.name, camera.width, camera.height, list(camera.params))
+    assert isinstance(found, Intrinsics | CentralLens)
+    return found
 
 
 def relative_path(file: Path, folder: Path) -> str:

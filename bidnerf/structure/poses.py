@@ -29,6 +29,7 @@ from bidnerf.structure.model import (
     reconstruct,
     relative_path,
     restore_size,
+    scale_to_depth,
     turn_upright,
     write_dataset,
 )
@@ -45,15 +46,16 @@ from bidnerf.structure.record import (
     remove_output,
 )
 from bidnerf.structure.sources import (
+    Frames,
     SourceImage,
     choose_frames,
+    frames_of,
     measure_frames,
     photos_of,
     refuse_panoramas,
     write_frames,
 )
 from bidnerf_core.camera import UPRIGHT, Camera, CameraSource
-from bidnerf_core.datasets import is_video
 from bidnerf_core.errors import Cancelled, InputError, InputWarning, amount
 from bidnerf_core.io import output_folder, to_plain, write_file
 from bidnerf_core.progress import Cancel, ProgressCallback, job_context
@@ -74,13 +76,14 @@ def find_poses(
     """Find the poses of photos by structure from motion (COLMAP, extra ``sfm``), and write them as a dataset into ``out``.
 
     ``photos`` is a folder of photos, or a video, from which frames are chosen by motion and sharpness and
-    written as images. ``camera`` (intrinsics, a file of them, or a source of either) is kept fixed; without it, focal length and
+    written as images, or a recording in a known format that has no poses, whose cameras are kept fixed. ``camera``
+    (intrinsics, a file of them, or a source of either) is kept fixed; without it, focal length and
     radial distortion are estimated, starting from EXIF. If the photos fall into several models, the largest
     is kept.
 
     The dataset is a ``transforms.json`` that refers to the photos in place; ``poses.json`` is the returned record,
     with the photos that were left out and why; ``sparse/0`` is the model in COLMAP's format. The unit of length is
-    arbitrary, and z points up. Interrupted work in the same folder is resumed; poses already found for the same
+    metres if a recording without poses has depth, otherwise arbitrary, and z points up. Interrupted work in the same folder is resumed; poses already found for the same
     photos are returned immediately, unless ``overwrite`` is set and ``reuse`` is not.
 
     ``progress`` receives each step; once ``cancel`` returns True, ``Cancelled`` is raised. Raises
@@ -89,9 +92,8 @@ def find_poses(
     """
     source, folder = Path(photos), Path(out)
     pycolmap = import_pycolmap(str(source))
-    images = [] if is_video(source) else photos_of(source, folder)
-    if not images and not source.is_file():
-        raise InputError("no such file", where=source, expected="a video or a folder of photos")
+    frames = frames_of(source, camera) if source.exists() else None
+    images = photos_of(source, folder, camera) if frames is None else []
     inputs = digest([image.file for image in images] or [source], camera)
     if reuse or not overwrite:
         with contextlib.suppress(*([InputError] if overwrite else [])):  # a damaged record is replaced
@@ -115,7 +117,7 @@ def find_poses(
             remove_output(folder)
         work = open_work(folder, inputs, video=not images)
         try:
-            record = _search(source, images, work, inputs, camera, pycolmap)
+            record = _search(source, frames or images, work, inputs, camera, pycolmap)
         except Cancelled as stopped:
             raise Cancelled(f"{folder}: {stopped}; the same command resumes from there") from stopped
         except InputError:
@@ -132,17 +134,17 @@ def find_poses(
 
 def _search(
     source: Path,
-    images: list[SourceImage],
+    images: list[SourceImage] | Frames,
     work: Path,
     inputs: str,
     camera: Camera | CameraSource | str | Path | None,
     pycolmap: Any,
 ) -> FoundPoses:
-    """Find the poses of ``images`` or, if there are none, of frames of the video ``source``; write the dataset next to ``work``."""
-    start, folder, database, video = time.monotonic(), work.parent, work / "database.db", not images
-    fixed, threads = camera is not None, max(1, torch.get_num_threads())
-    if video:
-        images = write_frames(source, folder / FRAMES, choose_frames(measure_frames(source)))
+    """Find the poses of the images of ``source``, or of frames chosen from a recording; write the dataset next to ``work``."""
+    start, folder, database, video = time.monotonic(), work.parent, work / "database.db", not isinstance(images, list)
+    threads = max(1, torch.get_num_threads())
+    if not isinstance(images, list):
+        images = write_frames(images, folder / FRAMES, choose_frames(measure_frames(images)))
     photos = list_photos(images, camera)
     try:
         stored = pycolmap.Database.open(database)
@@ -152,7 +154,7 @@ def _search(
     with stored as opened:
         photos.require_enough(source)
         if not opened.num_images():
-            write_cameras(opened, photos, fixed, pycolmap)
+            write_cameras(opened, photos, pycolmap)
         write_keypoints(opened, photos, pycolmap)
         photos.require_enough(source)
         keypoints = {photo.number: opened.num_keypoints_for_image(photo.number) for photo in photos.photos}
@@ -163,7 +165,7 @@ def _search(
             similar = similar_pairs([opened.read_descriptors(number).data for number in numbers])
             pairs = [(numbers[i], numbers[j]) for i, j in similar]
     match(database, pairs, threads, pycolmap)
-    models = reconstruct(database, work / "models", photos, fixed, threads, pycolmap)
+    models = reconstruct(database, work / "models", photos, threads, pycolmap)
     with pycolmap.Database.open(database) as opened:
         matched = zip(*opened.read_two_view_geometries(), strict=True)
         overlapping = [pycolmap.pair_id_to_image_pair(pair) for pair, seen in matched if len(seen.inlier_matches)]
@@ -179,9 +181,10 @@ def _search(
         model, by_number = models[0], {photo.number: photo for photo in photos.photos}
         sure, contradicting = count_contradictions(model, opened, pycolmap)
     error = model.compute_mean_reprojection_error()
+    metric = scale_to_depth(model, by_number, pycolmap)
     turn_upright(model, by_number, pycolmap)
     restore_size(model, by_number)
-    write_dataset(folder, by_number, model, folder / FRAMES if video else source)
+    write_dataset(folder, by_number, model, folder / FRAMES if video else source, "metres" if metric else "units")
     reasons = reasons_left_out(photos, models, Counter(itertools.chain(*overlapping)), keypoints)
     left_out = [
         LeftOut(image.name, relative_path(image.file, folder), reasons[image.name])
@@ -204,4 +207,5 @@ def _search(
         sure_pairs=sure,
         contradicting=contradicting,
         turned=turned,
+        metric=metric,
     )

@@ -33,7 +33,7 @@ class LeftOut:
 class FoundPoses:
     """The record of poses found by structure from motion; the poses are in the dataset next to it.
 
-    The length unit of the world depends on the first pair of photos and is not metres; z points up, as
+    The length unit of the world depends on the first pair of photos unless it is ``metric``; z points up, as
     estimated from the cameras. ``str()`` gives a human-readable summary.
     """
 
@@ -50,6 +50,7 @@ class FoundPoses:
     video: bool = False  # whether the photos are frames of a video, which were written next to this record
     sure_pairs: int = 0  # pairs of registered photos with too many matches to show different places
     contradicting: int = 0  # of these, pairs whose matches contradict the poses
+    metric: bool = False  # whether the unit is metres, by measured depth
     turned: int = 0  # registered photos with an EXIF orientation; their cameras are those of the images as stored
 
     @property
@@ -71,7 +72,7 @@ class FoundPoses:
     def __str__(self) -> str:
         lines = [
             f"poses of {self.placed} of {amount(self.photos, 'photo')}; {amount(self.points, 'point')}, mean error"
-            f" {self.reprojection_error:.2f} px"
+            f" {self.reprojection_error:.2f} px{'; in metres, by the measured depth' if self.metric else ''}"
         ]
         if len(self.models) > 1:
             sizes = ", ".join(map(str, self.models))

@@ -8,23 +8,29 @@ camera rests, many while it turns.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 
 import cv2
 import numpy as np
 from PIL import Image
 
-from bidnerf_core.camera import reduced_size
+from bidnerf_core.camera import Camera, CameraSource, reduced_size
 from bidnerf_core.datasets import (
     VIDEO_SUFFIXES,
+    Capture,
+    DatasetOptions,
+    DepthFile,
     Video,
     find_reader,
+    is_video,
     no_dataset,
     photos_below,
     unique_names,
+    unposed_recording,
+    warn_about,
 )
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import open_binary
@@ -33,11 +39,34 @@ from bidnerf_core.training import sharpness
 
 FRAME_STEP = 0.04
 """Image motion between chosen frames, as a fraction of the image diagonal."""
+FEW = 60
+"""Largest number of images of a recording that are all used; of more, frames are chosen as of a video."""
 MOST = 400
 """Largest number of chosen frames; in long videos, the steps are longer."""
 
 Measure: TypeAlias = tuple[float, float]
 """The motion accumulated up to a frame (in image diagonals), and the sharpness of the frame (octaves)."""
+
+
+class Frames(Protocol):
+    """The frames of a recording in chronological order: their times (seconds) and upright pixels."""
+
+    def __len__(self) -> int: ...
+
+    def __iter__(self) -> Iterator[tuple[float | None, np.ndarray]]: ...
+
+
+@dataclass(frozen=True)
+class CaptureFrames:
+    """The frames of a capture."""
+
+    capture: Capture
+
+    def __len__(self) -> int:
+        return len(self.capture)
+
+    def __iter__(self) -> Iterator[tuple[float | None, np.ndarray]]:
+        return ((timed.time, timed.frame.rgb_bytes.numpy()) for timed in self.capture)
 
 
 @dataclass(frozen=True)
@@ -47,27 +76,59 @@ class SourceImage:
     name: str  # unique among the images: the stem, prefixed with as many folders as needed
     file: Path
     time: float | None = None  # seconds, of a frame of a video
+    camera: CameraSource = CameraSource()  # as a recording states it
+    depth: DepthFile | None = None
+    depth_unit: float | None = None  # metres per step of the depth image, if it is an image of steps
 
 
-def photos_of(folder: Path, out: Path | None = None) -> list[SourceImage]:
-    """Return the photos of a folder in natural name order.
+def frames_of(source: Path, camera: Camera | CameraSource | str | Path | None) -> Frames | None:
+    """Return the frames that have to be written as images: those of a video, or of a recording that is a single file."""
+    if is_video(source):
+        return Video(source)
+    recording = unposed_recording(source, DatasetOptions(camera))
+    return CaptureFrames(recording) if recording is not None and recording.shots[0].file is None else None
 
-    If the folder itself has none, those of its subfolders are used, except for depth, masks and the like, and
-    ``out``. Raises ``InputError`` if there is no such folder, if there are no photos, and if poses are known.
+
+def photos_of(
+    folder: Path, out: Path | None = None, camera: Camera | CameraSource | str | Path | None = None
+) -> list[SourceImage]:
+    """Return the photos of a folder in natural name order, or of a recording without poses in chronological order.
+
+    If the folder itself has none, those of its subfolders are used, except for depth, masks and the like, and ``out``. Raises
+    ``InputError`` if there is no such folder, if there are no photos, and if poses are known.
     """
     if not folder.exists():
         raise InputError("no such file or folder", where=folder, expected="photos or a video")
-    if not folder.is_dir():
+    reader = find_reader(folder)
+    if not folder.is_dir() and reader is None:
         raise InputError(
             "is a file", where=folder, expected=f"a folder of photos or a video ({', '.join(VIDEO_SUFFIXES)})"
         )
-    reader = find_reader(folder)
     if reader is not None:
-        raise InputError(
-            f"is a dataset whose poses are known ({reader.expected}); train with it directly, or give only"
-            " the folder of the photos to find their poses again",
-            where=folder,
-        )
+        options = DatasetOptions(camera)
+        recording = unposed_recording(folder, options)
+        if recording is None:
+            raise InputError(
+                f"is a dataset whose poses are known ({reader.expected}); train with it directly, or give only"
+                " the folder of the photos to find their poses again",
+                where=folder,
+            )
+        warn_about(folder, f"its {recording.pose_file or 'recording'} has no poses, so they are found from its images")
+        chosen: Sequence[int] = range(len(recording))
+        if len(chosen) > FEW:
+            chosen = choose_frames(measure_frames(CaptureFrames(recording)))
+        return [
+            SourceImage(
+                shot.name,
+                shot.file,
+                shot.time,
+                shot.camera if isinstance(shot.camera, CameraSource) else CameraSource(shot.camera),
+                shot.depth,
+                recording.depth_unit,
+            )
+            for shot in (recording.shots[number] for number in chosen)
+            if shot.file is not None
+        ]
     files = photos_below(folder, out)
     if not files:
         raise no_dataset(folder)
@@ -88,15 +149,14 @@ def refuse_panoramas(photos: Sequence[SourceImage]) -> None:
             raise InputError("is a panorama (equirectangular)", where=photo.file, expected=expected)
 
 
-def measure_frames(video: Path) -> list[Measure]:
-    """Measure the image motion and sharpness of each frame of a video.
+def measure_frames(frames: Frames) -> list[Measure]:
+    """Measure the image motion and sharpness of each frame of a video or another recording.
 
     Up to 200 corners (Shi and Tomasi 1994) are tracked in images of at most 320 pixels a side, from an anchor frame until they have
     moved by two percent of the diagonal or half of them are lost.
     """
     count = counter("measuring frames", "frames")
-    frames, measures = Video(video), list[Measure]()
-    total = len(frames)
+    measures, total = list[Measure](), len(frames)
     before: np.ndarray | None = None
     points = start = np.zeros((0, 1, 2), np.float32)
     corners, until_anchor, motion = 0, 0.0, 0.0
@@ -138,11 +198,11 @@ def choose_frames(frames: Sequence[Measure]) -> list[int]:
     return sorted(chosen)
 
 
-def write_frames(video: Path, folder: Path, wanted: Collection[int]) -> list[SourceImage]:
+def write_frames(frames: Frames, folder: Path, wanted: Collection[int]) -> list[SourceImage]:
     """Write the frames with indices ``wanted`` to ``folder`` as NUMBER.jpg, and return them with their times."""
     folder.mkdir(parents=True, exist_ok=True)
     written, count = list[SourceImage](), counter("writing frames", "frames")
-    for number, (time, pixels) in enumerate(Video(video)):
+    for number, (time, pixels) in enumerate(frames):
         if number in wanted:
             image = SourceImage(f"{number:06d}", folder / f"{number:06d}.jpg", time)
             Image.fromarray(pixels).save(image.file, quality=95, subsampling=0)

@@ -303,7 +303,9 @@ def focal_length(pixels: int, angle: float) -> float:
 
 def same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Return whether two sizes (width, height) may belong to one image at two resolutions."""
-    return abs((size[0] * other[1] / (size[1] * other[0])) - 1) <= 0.005  # sizes are rounded when an image is resized
+    ratio = abs((size[0] * other[1] / (size[1] * other[0])) - 1)
+    smallest = min(*size, *other)
+    return ratio <= 0.005 or (smallest >= 64 and ratio * smallest < 1)  # sizes are rounded when an image is resized
 
 
 def reduced_size(width: int, height: int, largest: int) -> tuple[int, int]:

@@ -299,11 +299,16 @@ def colmap_camera(where: str, model: str, width: int, height: int, parameters: S
         return flat if kind == PERSPECTIVE else CentralLens(model, flat, tuple(rest))
 
 
-def colmap_model(camera: Intrinsics) -> tuple[str, list[float]]:
+def colmap_model(camera: Camera) -> tuple[str, list[float]]:
     """Return the name and parameters of the simplest COLMAP model that describes a camera.
 
-    Raises ``InputError`` for thin prism distortion or a tilted sensor, which no COLMAP model has.
+    Raises ``InputError`` for thin prism distortion or a tilted sensor, which no COLMAP model has, and for a panorama.
     """
+    if isinstance(camera, CentralLens):
+        c, kind = camera.stored, MODELS[camera.model][1]
+        return kind, [c.fx, c.fy, c.cx, c.cy, *camera.coefficients]
+    if not isinstance(camera, Intrinsics):
+        raise InputError("the camera is that of a panorama", expected="pinhole views cut from it, and their camera")
     k = camera.distortion
     if any(k[8:]):
         raise InputError(

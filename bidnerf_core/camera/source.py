@@ -155,18 +155,19 @@ def folder_camera(
     published: Intrinsics | None,
     unknown: str = "",
     ways: str = "a file",
+    is_needed: bool = True,
 ) -> CameraSource:
     """Return the single camera of a recording whose format stores none.
 
     In order of precedence, it is the ``given`` camera (intrinsics or a file), the file ``camera.json`` or ``cameras.txt``
     in ``folder``, or the ``published`` camera of the format. Raises ``InputError`` if there is none, with the reason
-    ``unknown`` and the ``ways`` to give one, and for a given file that does not exist.
+    ``unknown`` and the ``ways`` to give one, unless the camera is not needed, and for a given file that does not exist.
     """
     if isinstance(given, Path) and not given.exists():
         raise InputError("no such file", where=given, expected=f"the camera of {folder}: {ways}")
     beside = next((file for name in ("camera.json", "cameras.txt") if (file := folder / name).is_file()), None)
     camera = given or beside or published
-    if camera is None:
+    if camera is None and is_needed:
         raise InputError(
             f"{unknown};",
             where=folder,

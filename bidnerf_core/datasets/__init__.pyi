@@ -16,6 +16,7 @@ from .colmap_files import read_posed_images as read_posed_images
 from .colmap_files import stored_keypoints as stored_keypoints
 from .file_names import IMAGE_ENDINGS as IMAGE_ENDINGS
 from .file_names import FileNames as FileNames
+from .file_names import is_auxiliary as is_auxiliary
 from .formats.colmap import colmap_models as colmap_models
 from .formats.colmap import colmap_project as colmap_project
 from .formats.colmap import shot_of as shot_of
@@ -45,6 +46,7 @@ from .reader import open_dataset as open_dataset
 from .reader import open_sequence as open_sequence
 from .trajectories import column_names as column_names
 from .trajectories import numbers_in as numbers_in
+from .trajectories import pose_numbers as pose_numbers
 from .trajectories import pose_of_matrix as pose_of_matrix
 from .trajectories import pose_of_numbers as pose_of_numbers
 from .trajectories import read_matrices as read_matrices
@@ -56,6 +58,7 @@ from .unposed import POSERS as POSERS
 from .unposed import Poser as Poser
 from .unposed import lacks_poses as lacks_poses
 from .unposed import photos_below as photos_below
+from .unposed import unposed_recording as unposed_recording
 from .video import VIDEO_SUFFIXES as VIDEO_SUFFIXES
 from .video import Video as Video
 from .video import VideoPicture as VideoPicture

@@ -35,6 +35,9 @@ class DatasetOptions:
     """camera of images whose format stores none: a file with intrinsics from nerfstudio, COLMAP, ROS or OpenCV (YAML), Open3D,
     hloc or 3D Gaussian Splatting (TUM RGB-D: also freiburg1, freiburg2 or freiburg3)"""
 
+    images: Annotated[str | Path | None, EXPERT, "FOLDER"] = None
+    """folder of the images that the files of a dataset list, if they lie elsewhere"""
+
     split: Annotated[str, "NAME"] = "train"
     """split of the dataset; all: every image with a pose"""
 
@@ -122,6 +125,13 @@ class DatasetOptions:
         if self.masks is None or isinstance(self.masks, MaskFolder):
             return self.masks
         return MaskFolder(self.masks, self.mask_hides)
+
+    @property
+    def image_folder(self) -> Path | None:
+        """The folder of the images, if it is given. Raises ``InputError`` unless it is a folder."""
+        if self.images is None or (folder := Path(self.images)).is_dir():
+            return None if self.images is None else folder
+        raise InputError("no such folder", where=folder, expected="the folder of the images")
 
     @property
     def registration(self) -> DepthRegistration | None:

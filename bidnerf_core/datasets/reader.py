@@ -21,7 +21,7 @@ from bidnerf_core.io import Background as Background  # for authors of readers
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
 
 Match = TypeVar("Match")
-OpenQuestion = Literal["camera", "focal", "register_depth", "depth_unit"]
+OpenQuestion = Literal["camera", "focal", "register_depth", "depth_unit", "images"]
 """An option of ``DatasetOptions`` that a format may leave open."""
 
 
@@ -67,6 +67,7 @@ def read_capture(
             source.is_given and source.camera is None,
             "is a dataset; give a camera with all intrinsics (`camera`)",
         ),
+        ("images", options.images is not None, "has its images where its format says; leave out images"),
     ]
     for option, is_given, problem in given:
         if is_given and option not in reader.accepts:
@@ -119,6 +120,7 @@ def open_dataset(
     register_depth: DepthRegistration | None = None,
     depth_unit: float | None = None,
     masks: str | Path | MaskFolder | None = None,
+    images: str | Path | None = None,
 ) -> Capture:
     """Open the dataset in the folder ``path``, see ``DatasetOptions.open``.
 
@@ -127,10 +129,11 @@ def open_dataset(
     (intrinsics or a file of them) is for formats that store no camera, such as TUM RGB-D. ``register_depth``
     determines whether depth is registered to the colour camera, and from which sensor; the default depends on
     the format. ``depth_unit`` (metres per step of depth images) overrides the unit of the format. ``masks``
-    is a folder of images whose black pixels are ignored (see ``MaskFolder``).
+    is a folder of images whose black pixels are ignored (see ``MaskFolder``), ``images`` the folder of the images that
+    the files of a dataset list, if they lie elsewhere.
     """
     return DatasetOptions(
-        camera, register_depth=register_depth, depth_unit=depth_unit, masks=masks, background=background
+        camera, images=images, register_depth=register_depth, depth_unit=depth_unit, masks=masks, background=background
     ).open(path, readers)
 
 
@@ -163,7 +166,10 @@ class Reader(Protocol):
     accepts: Collection[OpenQuestion] = ()
     """The options that the format accepts: "camera" if its files have none, "focal" if a focal length suffices for it,
     "register_depth" if its depth may not be registered to its images, "depth_unit" if its depth images may be in another
-    unit. Others are rejected before the reader is called."""
+    unit, "images" if its files list images that may lie elsewhere. Others are rejected before the reader is called."""
+
+    may_lack_poses: bool = False
+    """Whether the format is that of recordings, whose poses may be missing: they are then photos with cameras and times."""
 
     suffixes: Collection[str] = ()
     """The extensions (".r3d") of single files that hold a whole dataset; the paths of such files are passed
@@ -209,6 +215,7 @@ class Format(Generic[Match]):
     accepts: Collection[OpenQuestion] = ()
     suffixes: Collection[str] = ()
     precedence: int = 0
+    may_lack_poses: bool = False
 
     def recognises(self, path: Path) -> bool:
         return bool(self.find(path))

@@ -4,18 +4,34 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
+import warnings
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from bidnerf_core.camera import Camera, CameraSource
-from bidnerf_core.datasets.capture import warn_about
+from bidnerf_core.datasets.capture import Capture, warn_about
+from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, is_auxiliary
+from bidnerf_core.datasets.options import AS_STORED, DatasetOptions
 from bidnerf_core.datasets.reader import find_reader
 from bidnerf_core.datasets.video import is_video
-from bidnerf_core.errors import InputError, enumeration
+from bidnerf_core.errors import InputError, InputWarning, amount, enumeration
 from bidnerf_core.frames import natural_order, photos_in
-from bidnerf_core.io import read_header
+from bidnerf_core.io import open_binary, read_header
 from bidnerf_core.registry import Plugins, interface_defects
+
+POSE_NAMES = re.compile(
+    r"(?<![a-z])(poses?|cams?|c2w|w2c|gt)(?![a-z])|pose_?graph|traj|ground_?truth|odom|extrinsic|sfm_data|bundle.*\.out"
+    r"|^cameras(_\w+)?(\.(json|npz|npy|csv|xml|sfm|bin))?$|^images\.(txt|bin)$|transforms.*\.json|\.(nvm|sfm|g2o|tum)$",
+    re.IGNORECASE,
+)
+"""The names of files and folders that usually hold poses, in whatever format."""
+DERIVED = re.compile(
+    r"(.+?)[_.-](depth|disp(arity)?|normals?|masks?|seg\w*|label\w*|conf\w*)([_.-]?(vis\w*|colou?r\w*))?", re.I
+)
+"""The stem of a picture computed from a photo, whose stem is the first group."""
 
 
 @runtime_checkable
@@ -54,64 +70,128 @@ POSERS: Plugins[Poser] = Plugins("posers", lambda poser: interface_defects(poser
 """The posers by name."""
 
 
-def lacks_poses(path: str | Path) -> bool:
-    """Return whether a path is a video, or a folder of photos that no dataset reader recognizes."""
+def lacks_poses(path: str | Path, options: DatasetOptions = AS_STORED) -> bool:
+    """Return whether a path is a video, a folder of photos that no reader recognizes, or a recording without any pose."""
     below = Path(path)
     if find_reader(below) is not None:
-        return False
-    return bool(photos_below(below)) if below.is_dir() else is_video(below)
+        return unposed_recording(below, options) is not None
+    return (bool(photos_in(below)[0]) or any(_subfolders(below, None))) if below.is_dir() else is_video(below)
+
+
+def unposed_recording(path: Path, options: DatasetOptions = AS_STORED) -> Capture | None:
+    """Return the frames of a recording in a known format if none of them has a pose; None for anything else."""
+    if not getattr(find_reader(path), "may_lack_poses", False):
+        return None
+    with warnings.catch_warnings(), contextlib.suppress(InputError):  # both come again when the dataset is read
+        warnings.simplefilter("ignore", InputWarning)
+        capture = options.open_sequence(path)
+        return None if any(shot.T_world_camera for shot in capture.shots) else capture
+    return None
 
 
 def photos_below(folder: Path, out: Path | None = None) -> list[Path]:
     """Return the photos of a folder in natural order of their names or, if it has none, those of its subfolders.
 
-    Depth, masks and the like are left out, as are datasets, smaller copies of other photos, and the folder ``out``.
+    Datasets and the folder ``out`` are left out and so are, with remarks, depth, masks and copies of other photos. Another
+    remark names the files that usually hold poses, since nothing reads them.
     """
-    own, _ = photos_in(folder)
-    if own:
-        return own
-    found = _without_copies(folder, list(_subfolders(folder, out)))
-    return sorted(found, key=lambda file: natural_order(file.relative_to(folder).as_posix()))
+    unread = list(_pose_files(folder, out))
+    if unread:
+        warn_about(
+            folder,
+            f"{enumeration(unread[:3])}{f' and {len(unread) - 3} more' if len(unread) > 3 else ''}: usually poses, but in a format"
+            " that is not read; new ones are searched for, in a unit and a world of their own. Convert the poses to"
+            " transforms.json to use them",
+        )
+    photos = _without_copies(folder, photos_in(folder)[0] or list(_subfolders(folder, out)))
+    return sorted(photos, key=lambda file: natural_order(file.relative_to(folder).as_posix()))
+
+
+def _pose_files(folder: Path, out: Path | None) -> Iterator[str]:
+    """Yield the files and folders that usually hold poses, and a sidecar file of RealityCapture, up to two folders below."""
+    for below, inside, names in os.walk(folder):
+        here = Path(below)
+        if out is not None and here == out:
+            inside.clear()
+            continue
+        poses = sorted(name for name in (*inside, *names) if POSE_NAMES.search(name) and not _is_image(name))
+        for name in [name for name in names if name.lower().endswith(".xmp")][:1]:
+            with contextlib.suppress(InputError), open_binary(here / name, "XMP") as file:
+                poses += [name] if b"xcr:Position" in file.read(2**16) else []
+        yield from (str((here / name).relative_to(folder)) for name in poses)
+        inside[:] = [n for n in inside if n not in poses and not n.startswith(".") and here.parent != folder]
+
+
+def _is_image(name: str) -> bool:
+    return Path(name).suffix.lower() in IMAGE_ENDINGS[1:]
 
 
 def _without_copies(folder: Path, photos: Sequence[Path]) -> list[Path]:
-    """Return the photos without smaller copies of others, as in ``images_2`` and ``images_4`` beside ``images``.
+    """Return the photos without depth, pictures computed from a photo, the same photo in another format, and smaller copies.
 
-    A folder holds copies if a folder beside it has larger photos of the same names and aspect ratio; a remark names
-    such folders.
+    Remarks name what is left out. A folder holds smaller copies, as ``images_2`` beside ``images``, if a folder beside it
+    has larger photos of the same names and aspect ratio.
     """
-    groups: dict[Path, list[Path]] = {}
-    for photo in photos:
-        groups.setdefault(photo.parent, []).append(photo)
-    copies, alike = list[Path](), dict[tuple[Path, frozenset[str]], list[tuple[int, int, Path]]]()
+    left, whole = list(photos), {photo.with_suffix("") for photo in photos}
+
+    def leave_out(copies: Sequence[Path], what: str) -> None:
+        if copies and len(copies) < len(left):
+            left[:] = [photo for photo in left if photo not in set(copies)]
+            names = dict.fromkeys(str((c.parent if c.parent != folder else c).relative_to(folder)) for c in copies)
+            listed = enumeration([*list(names)[:4], *(["more"] if len(names) > 4 else [])])
+            warn_about(folder, f"{listed}: {what}, left out ({amount(len(copies), 'image')})")
+
+    leave_out([photo for photo in left if _is_deep_grey(photo)], "grey images of 16 bits or more, such as depth")
+    matches = [(photo, DERIVED.fullmatch(photo.stem)) for photo in left]
+    leave_out(
+        [photo for photo, match in matches if match and photo.with_name(match[1]) in whole], "computed from photos"
+    )
+    formats = defaultdict[Path, list[Path]](list)
+    for photo in left:
+        formats[photo.with_suffix("")].append(photo)
+    for files in formats.values():
+        files.sort(
+            key=lambda file: (file.suffix.lower() not in (".jpg", ".jpeg"), IMAGE_ENDINGS.index(file.suffix.lower()))
+        )
+    leave_out([file for files in formats.values() for file in files[1:]], "the same photos in another format")
+    groups, alike = (
+        defaultdict[Path, list[Path]](list),
+        defaultdict[tuple[Path, frozenset[str]], list[tuple[int, int, Path]]](list),
+    )
+    for photo in left:
+        groups[photo.parent].append(photo)
     for below, group in groups.items():
         with contextlib.suppress(InputError):  # raised again when that photo is read
             header = read_header(group[0])
-            key = below.parent, frozenset(photo.stem for photo in group)
-            alike.setdefault(key, []).append((header.width, header.height, below))
+            alike[below.parent, frozenset(photo.stem for photo in group)].append((header.width, header.height, below))
+    smaller = set[Path]()
     for sized in alike.values():
-        whole_width, whole_height, _ = max(sized)
+        largest, height_of_largest, _ = max(sized)
         for width, height, below in sized:
             # Sizes are rounded.
-            if width < whole_width and abs(height - width * whole_height / whole_width) <= 1:
-                copies.append(below)
-    if copies:
-        warn_about(
-            folder,
-            f"{enumeration([str(below.relative_to(folder)) for below in copies])}: smaller copies of the photos beside"
-            " them, which are left out",
-        )
-    return [photo for photo in photos if photo.parent not in copies]
+            if width < largest and abs(height - width * height_of_largest / largest) <= 1:
+                smaller.add(below)
+    leave_out([photo for photo in left if photo.parent in smaller], "smaller copies of the photos beside them")
+    return left
+
+
+def _is_deep_grey(photo: Path) -> bool:
+    if photo.suffix.lower() in (".jpg", ".jpeg"):
+        return False
+    try:
+        return read_header(photo).deep_grey
+    except InputError:  # raised again when that photo is read
+        return False
 
 
 def _subfolders(folder: Path, out: Path | None) -> Iterator[Path]:
-    """Yield the photos in subfolders of ``folder`` at any depth, except those of datasets."""
+    """Yield the photos in subfolders of ``folder`` at any depth, except those of datasets and of auxiliary folders."""
     for below, inside, _ in os.walk(folder):
         inside[:] = sorted(
             name
             for name in inside
             if not name.startswith(".")
-            and name.lower() not in ("depth", "depths", "mask", "masks", "confidence", "conf", "thumbnails")
+            and not is_auxiliary(name)
             and not (out is not None and out.exists() and Path(below, name).samefile(out))
         )
         if Path(below) != folder:

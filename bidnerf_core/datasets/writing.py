@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera import CentralLens, Intrinsics
 from bidnerf_core.datasets.capture import SPLITS
 from bidnerf_core.datasets.formats.transforms_json import METRES_PER_DEPTH_UNIT, SPLIT_FILES
 from bidnerf_core.errors import InputError
@@ -60,22 +60,27 @@ def _write_view(folder: Path, split: str, view: View, background: tuple[float, f
 
 
 def frame_entry(
-    file_path: str, name: str, camera: Intrinsics, T_world_camera: SE3, time: float | None = None
+    file_path: str, name: str, camera: Intrinsics | CentralLens, T_world_camera: SE3, time: float | None = None
 ) -> dict[str, Any]:
     """Return an entry of ``frames`` for a ``transforms.json``: an image, its camera, its pose and its time (seconds).
 
     Raises ``InputError`` for a lens that the format cannot describe.
     """
-    lens = ("k1", "k2", "p1", "p2", "k3")
-    if len(camera.distortion) > len(lens):
+    lens, model = ["k1", "k2", "k3", "k4"], dict[str, str]()
+    if isinstance(camera, CentralLens):
+        values, model, camera = camera.coefficients, {"camera_model": camera.model}, camera.stored
+    else:
+        values, lens = camera.distortion, ["k1", "k2", "p1", "p2", "k3"]
+    if len(values) > len(lens):
         raise InputError(
-            f"the lens has {len(camera.distortion)} coefficients",
+            f"the lens has {len(values)} coefficients",
             where=f"frame {name}",
             expected=f"at most {len(lens)}",
         )
     matrix = T_world_camera.to("cpu", torch.float64).matrix()
     return {
         "file_path": file_path,
+        **model,
         # The y and z axes of the camera are reversed in OpenGL.
         "transform_matrix": (matrix * matrix.new_tensor([1.0, -1.0, -1.0, 1.0])).tolist(),
         **({} if time is None else {"time": time}),
@@ -85,7 +90,7 @@ def frame_entry(
         "cy": camera.cy,
         "w": camera.width,
         "h": camera.height,
-        **dict(zip(lens, camera.distortion, strict=False)),
+        **dict(zip(lens, values, strict=False)),
     }
 
 

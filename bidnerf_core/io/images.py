@@ -57,13 +57,14 @@ class ImageHeader:
     width: int
     height: int
     has_alpha: bool
+    deep_grey: bool = False  # one channel of more than 8 bits, as in depth images
 
 
 def read_header(path: ImageSource) -> ImageHeader:
-    """Read the size of an image and whether it has alpha, but no pixels. Raises ``InputError`` as ``open_image`` does."""
+    """Read the size of an image and what its channels are, but no pixels. Raises ``InputError`` as ``open_image`` does."""
     with open_image(path) as image:
         has_alpha = image.mode in ("LA", "RGBA", "PA") or (image.mode == "P" and image.has_transparency_data)
-        return ImageHeader(image.width, image.height, has_alpha)
+        return ImageHeader(image.width, image.height, has_alpha, image.mode[:1] in "IF")
 
 
 def read_image(

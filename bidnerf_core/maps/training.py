@@ -340,7 +340,7 @@ def open_posed_images(
     dataset, whose path is yielded. The dataset is in a folder next to the map ``out``, or in a temporary
     folder for a map in memory; poses found earlier are reused. Any other ``data`` is yielded unchanged.
     """
-    if not isinstance(data, str | Path) or not lacks_poses(data):
+    if not isinstance(data, str | Path) or not lacks_poses(data, options):
         yield data, options
         return
     with tempfile.TemporaryDirectory() if out is None else contextlib.nullcontext(poses_folder(out)) as folder:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from scan_layouts import (
     write_nerfstudio,
     write_opensfm,
     write_polycam,
+    write_scannet,
     write_stray_scanner,
     write_video,
 )
@@ -112,7 +114,32 @@ def nanoseconds(root: Path) -> Path:
     return folder
 
 
+def elsewhere(write: Callable[[Path, Any], Path], suffix: str = ".png") -> Write:
+    """The images lie in a folder of another name, as another format, beside pictures computed from them."""
+
+    def moved_there(root: Path) -> Path:
+        folder = write(root, small_views(COUNT))
+        for image in (folder / "images").iterdir():
+            write_image(folder / "masks_vis" / image.name, np.zeros((12, 16), np.uint8))
+            Image.open(image).save((folder / image.name).with_suffix(suffix))
+            image.unlink()
+            (folder / "colour" / "left").mkdir(parents=True, exist_ok=True)
+            (folder / image.name).with_suffix(suffix).rename(folder / "colour/left" / f"{image.stem}{suffix}")
+        return folder
+
+    return moved_there
+
+
 READ: dict[str, tuple[Write, str]] = {
+    **{
+        f"elsewhere, {write.__name__}": (elsewhere(write, suffix), f"is taken for colour/left/{first}{suffix}")
+        for write, suffix, first in (
+            (write_nerfstudio, ".jpg", "r_0"),
+            (write_colmap, ".bmp", "r_0"),
+            (write_metashape, ".png", "IMG_0"),
+            (write_opensfm, ".jpg", "0"),
+        )
+    },
     "moved": (moved("images"), "'./data/desk/images/r_0.png' is taken for images/r_0.png"),
     "moved, flat": (moved("."), "is taken for r_0.png"),
     "Polycam from a Mac": (companions(write_polycam), ""),
@@ -142,6 +169,19 @@ def test_what_is_kept_otherwise_is_read(kind: str, tmp_path: Path) -> None:
     assert sizes == {(8, 6) if "reduced" in kind else (SMALL.width, SMALL.height)}
     times = [shot.time for shot in open_sequence(folder).shots if shot.time is not None]
     assert not times or max(times) - min(times) < 2 * COUNT
+
+
+def test_a_folder_of_images_is_named_where_several_fit(tmp_path: Path) -> None:
+    folder = elsewhere(write_colmap)(tmp_path)
+    shutil.copytree(folder / "colour/left", folder / "colour/right")
+    with refused(where=folder / "images/r_0.png", found="no such image"):
+        read_all(folder)
+    assert len(read_all(folder, images=folder / "colour/right")) == COUNT
+    with refused(where=tmp_path / "none", found="no such folder", expected="the folder of the images"):
+        open_dataset(folder, images=tmp_path / "none")
+    (tmp_path / "scannet").mkdir()
+    with refused(found="has its images where its format says"):
+        open_dataset(write_scannet(tmp_path / "scannet", small_views(COUNT)), images=folder)
 
 
 def turned(root: Path) -> Path:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -28,7 +28,7 @@ from bidnerf_core.frames import View
 from bidnerf_core.maps import read_views
 from bidnerf_core.registry import list_plugins
 from optional import require
-from scan_layouts import LAYOUTS, PERIOD, message, read_all, small_views
+from scan_layouts import LAYOUTS, PERIOD, SMALL, message, read_all, small_views, write_ace
 
 COUNT = 10
 LAWS = [name for name in dir(ReaderContract) if name.startswith("test_")]
@@ -207,3 +207,18 @@ def test_an_answer_knows_its_image_file(kind: str, tmp_path: Path) -> None:
         files = [source.read(place).file for place in range(len(source.names))]
         assert all(file is not None and file.is_file() and file.suffix in (".png", ".jpg") for file in files)
         assert len(set(files)) == len(files)
+
+
+def test_folders_of_ace_are_splits_and_digits_of_nsvf_too(tmp_path: Path) -> None:
+    views = small_views(3)
+    for split in ("train", "test"):
+        write_ace(tmp_path / "ace", views, split=split)
+    capture = open_dataset(tmp_path / "ace")
+    assert {shot.splits for shot in capture.shots if "train" in shot.parts} == {("train",)}
+    assert {shot.splits for shot in capture.shots if "test" in shot.parts} == {("test",)}
+    write_ace(tmp_path / "nsvf", views, nsvf=True)
+    for file in list((tmp_path / "nsvf").rglob("frame_0*")):
+        file.rename(file.with_name(file.name.replace("frame_0000", "").replace(".", "_frame.")))
+    assert [shot.splits for shot in open_dataset(tmp_path / "nsvf").shots] == [("train",), ("val",), ("test",)]
+    (tmp_path / "nsvf" / "intrinsics.txt").write_text("20 8.5 6.25 0\n")
+    assert open_dataset(tmp_path / "nsvf").shots[0].camera == replace(SMALL, fy=20.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from PIL import Image
 
 from bidnerf.structure import photos_of, refuse_panoramas
+from bidnerf_core.datasets import lacks_poses
 from bidnerf_core.errors import InputWarning
 from refusals import refused
 
@@ -45,3 +47,43 @@ def test_signals_go_on_to_their_handlers_after_pycolmap_is_imported() -> None:
     )
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False)
     assert (ended.returncode, ended.stderr) == (7, b"")
+
+
+def picture(file: Path, grey16: bool = False, seed: int = 0) -> Path:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    noise = np.random.default_rng(seed).integers(0, 255, (48, 64) if grey16 else (48, 64, 3))
+    Image.fromarray(noise.astype(np.uint16 if grey16 else np.uint8)).save(file)
+    return file
+
+
+@pytest.mark.parametrize(
+    ("names", "remark"),
+    {
+        "16-bit grey": (
+            ["a_rgb/1.jpg", "a_measured/1.png"],
+            "a_measured: grey images of 16 bits or more, such as depth",
+        ),
+        "pictures computed from photos": (["1.jpg", "1_depth_vis.png"], "1_depth_vis.png: computed from photos"),
+        "another format": (["1.jpg", "1.png"], "1.png: the same photos in another format"),
+        "folders of derived pictures": (["rgb/1.jpg", "rgb/normal_vis.txt", "normal_vis/1.png"], None),
+        "poses of an app": (["1.jpg", "my_poses.txt"], "my_poses.txt: usually poses, but in a format that is not read"),
+        "poses of each image": (["images/1.jpg", "cams/1_cam.txt"], "cams: usually poses"),
+        "RealityCapture's sidecars": (["1.jpg", "1.xmp"], "1.xmp: usually poses"),
+        "a COLMAP camera": (["1.jpg", "cameras.txt", "camera.json", "purpose.txt", "1.xml"], None),
+    }.values(),
+)
+def test_what_lies_beside_photos_is_no_photo_and_is_named(tmp_path: Path, names: list[str], remark: str | None) -> None:
+    for name in names:
+        if name.endswith((".jpg", ".png")):
+            picture(tmp_path / name, "measured" in name)
+        else:
+            (tmp_path / name).parent.mkdir(exist_ok=True)
+            (tmp_path / name).write_text('<rdf xcr:Position="1 2 3"/>')
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert lacks_poses(tmp_path)
+        found = photos_of(tmp_path)
+    assert [image.file.name for image in found] == ["1.jpg"]
+    texts = [str(warning.message) for warning in caught]
+    assert len(texts) == (remark is not None)
+    assert all(text.startswith(f"{tmp_path}: {remark}") for text in texts)

@@ -6,6 +6,7 @@ import json
 import re
 import sys
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -36,7 +37,8 @@ from bidnerf.structure.sources import (
     write_frames,
 )
 from bidnerf.testing import PoserContract
-from bidnerf_core.datasets import lacks_poses
+from bidnerf_core.camera import CentralLens
+from bidnerf_core.datasets import Video, lacks_poses
 from bidnerf_core.geometry import fit_similarity, look_at
 
 # Inside: each stage of the search for poses, with its rare geometry
@@ -44,8 +46,9 @@ from bidnerf_core.maps.training import open_posed_images, poses_folder
 from commands import Run
 from optional import require
 from photo_files import write_photo
-from photo_room import CAMERA, photograph, walk, write_photos
+from photo_room import CAMERA, photograph, room_depth, walk, write_photos
 from refusals import refused
+from scan_layouts import write_tum
 
 pytestmark = pytest.mark.slow
 
@@ -319,8 +322,8 @@ def test_photos_of_one_lens_share_a_camera_however_they_are_turned(tmp_path: Pat
     ]
     found = list_photos([SourceImage(file.stem, file) for file in files], None)
     assert [photo.camera for photo in found.photos] == [1, 1, 2, 3]
-    assert found.known_focal == {1: True, 2: True, 3: False}
-    assert found.cameras[2].fx == pytest.approx(2 * found.cameras[1].fx)
+    assert (found.known_focal, found.fixed) == ({1, 2}, set())
+    assert found.cameras[2].pinhole.fx == pytest.approx(2 * found.cameras[1].pinhole.fx)
 
 
 @given(
@@ -330,10 +333,42 @@ def test_photos_of_one_lens_share_a_camera_however_they_are_turned(tmp_path: Pat
 def test_lenses_go_to_colmap_and_back(numbers: tuple[float, ...], lens: tuple[float, ...]) -> None:
     import pycolmap
 
-    there = from_colmap(to_colmap(bn.Intrinsics(*numbers, 320, 240, lens), 1, pycolmap))
+    pinhole = bn.Intrinsics(*numbers, 320, 240)
+    for model, count in (("OPENCV_FISHEYE", 4), ("DIVISION", 1)):
+        fisheye = CentralLens(model, pinhole, (*lens, *[0.0] * 4)[:count])
+        assert from_colmap(to_colmap(fisheye, 1, pycolmap)) == fisheye
+    there = from_colmap(to_colmap(replace(pinhole, distortion=lens), 1, pycolmap))
+    assert isinstance(there, bn.Intrinsics)
     assert (*there.distortion, *[0] * 8)[: len(lens)] == pytest.approx(lens)
     assert (there.fx, there.fy, there.cx, there.cy) == numbers
     assert (there.width, there.height) == (320, 240)
+
+
+@pytest.mark.parametrize("fisheye", [False, True])
+def test_a_recording_without_poses_is_photos_with_a_camera_and_depth(tmp_path: Path, fisheye: bool) -> None:
+    """The camera is the recording's, or the given fisheye lens, and the measured depth determines the scale."""
+    poses, folder = walk(PLACED), tmp_path / "recording"
+    lens = CentralLens("OPENCV_FISHEYE", CAMERA, (0.02, 0.0, 0.0, 0.0))
+    views = [bn.View(bn.Frame.from_numpy(photograph(pose), CAMERA), pose) for pose in poses]
+    if fisheye:
+        write_photos(folder, poses)
+    else:
+        write_tum(folder, [bn.View(v.frame.replace(depth=room_depth(v.T_ref_camera)), v.T_ref_camera) for v in views])
+        (folder / "groundtruth.txt").unlink()
+        assert lacks_poses(folder)
+    found = bn.find_poses(folder, tmp_path / "poses", lens if fisheye else None)
+    data = bn.open_dataset(tmp_path / "poses")
+    assert (found.placed, found.metric, data.unit) == (PLACED, not fisheye, "units" if fisheye else "metres")
+    shots = sorted(data.shots, key=lambda shot: shot.name)
+    assert all(shot.camera == (lens if fisheye else CAMERA) for shot in shots)
+    if not fisheye:
+        assert all(shot.depth is not None for shot in shots)
+        steps = [
+            torch.linalg.vector_norm(a.T_world_camera.translation - b.T_world_camera.translation)
+            for a, b in pairwise(shots)
+        ]
+        truth = [torch.linalg.vector_norm(a.translation - b.translation) for a, b in pairwise(poses)]
+        assert torch.stack(steps) == pytest.approx(torch.stack(truth), rel=0.03)
 
 
 def test_upright_axes_are_those_of_the_turned_image(tmp_path: Path) -> None:
@@ -402,14 +437,14 @@ def test_a_video_is_thinned_by_its_motion_and_not_by_its_shaking(tmp_path: Path)
                 image = cv2.blur(image, (9, 1))
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode())
-    measures = measure_frames(tmp_path / "clip.mp4")
+    measures = measure_frames(Video(tmp_path / "clip.mp4"))
     assert len(measures) == len(poses)
     rest = measures[35][0] - measures[16][0]
     assert rest < 0.2 * measures[-1][0]
     frames = choose_frames(measures)
     assert sum(16 <= number < 36 for number in frames) <= 2
     assert sum(number % 3 == 1 for number in frames) <= len(frames) / 6
-    written = write_frames(tmp_path / "clip.mp4", tmp_path / "images", frames)
+    written = write_frames(Video(tmp_path / "clip.mp4"), tmp_path / "images", frames)
     assert [int(image.name) for image in written] == frames
     assert written[-1].time == pytest.approx(frames[-1] / 30, abs=1e-3)
     assert lacks_poses(tmp_path / "clip.mp4")

@@ -55,6 +55,14 @@ def photograph(T_world_camera: SE3, seed: int = 0, walls: int = 6, camera: Intri
     return image.round().astype(np.uint8)
 
 
+def room_depth(T_world_camera: SE3, camera: Intrinsics = CAMERA) -> torch.Tensor:
+    """Return the planar depth (h, w) of the walls in metres."""
+    rays = camera.unproject(camera.pixel_centres(torch.float64))
+    turned, origin = T_world_camera.rotate(rays), T_world_camera.translation
+    ahead = ((turned.sign() * HALF - origin) / turned).amin(-1)
+    return (ahead * rays[..., 2]).float()
+
+
 def write_photos(folder: Path, poses: Sequence[SE3], seed: int = 0, walls: int = 6, first: int = 0) -> list[Path]:
     """Write photos NUMBER.png of the room from each pose, numbered from ``first`` on."""
     folder.mkdir(parents=True, exist_ok=True)

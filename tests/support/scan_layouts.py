@@ -433,6 +433,83 @@ def write_metashape(folder: Path, views: Sequence[View]) -> Path:
     return folder
 
 
+def write_ace(folder: Path, views: Sequence[View], nsvf: bool = False, split: str = "") -> Path:
+    """Images of one split, or in the folder itself, with their calibrations as matrices."""
+    part = folder / split
+    for number, view in enumerate(views):
+        name = f"frame_{number:05d}"
+        write_image(part / "rgb" / f"{name}.png", pixels(view))
+        write_image(part / "depth" / f"{name}.png", millimetres(view))
+        calibration = part / "intrinsics.txt" if nsvf else part / "calibration" / f"{name}.txt"
+        pose = part / ("pose" if nsvf else "poses") / f"{name}.txt"
+        for file, numbers in ((pose, matrix(view)), (calibration, view.frame.intrinsics.matrix())):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            np.savetxt(file, numbers, fmt="%.17g")
+    return folder
+
+
+def write_cambridge(folder: Path, views: Sequence[View]) -> Path:
+    """Every eighth frame, the first among them, is a test; the model lists other endings than those of the images."""
+    listed: dict[str, list[str]] = {"train": [], "test": []}
+    model = []
+    for number, view in enumerate(views):
+        write_image(folder / "seq1" / f"frame{number:05d}.png", pixels(view))
+        x, y, z, w = quaternion(np.linalg.inv(matrix(view)))
+        centre_of_camera = " ".join(map(repr, matrix(view)[:3, 3].tolist()))
+        listed["train" if number % 8 else "test"].append(
+            f"seq1/frame{number:05d}.png {centre_of_camera} {w} {x} {y} {z}"
+        )
+        model.append(f"seq1/frame{number:05d}.jpg\t{view.frame.intrinsics.fx} {w} {x} {y} {z} {centre_of_camera} 0 0")
+    for split, rows in listed.items():
+        head = ["Visual Landmark Dataset V1", "ImageFile, Camera Position [X Y Z W P Q R]", ""]
+        (folder / f"dataset_{split}.txt").write_text("\n".join([*head, *rows]) + "\n")
+    (folder / "reconstruction.nvm").write_text("\n".join(["NVM_V3", "", f"{len(views)}", *model, "", "0"]) + "\n")
+    return folder
+
+
+def write_vsfm(folder: Path, views: Sequence[View]) -> Path:
+    """A model of VisualSFM alone."""
+    write_cambridge(folder, views)
+    for split in ("train", "test"):
+        (folder / f"dataset_{split}.txt").unlink()
+    return folder
+
+
+def write_map_free(folder: Path, views: Sequence[View]) -> Path:
+    poses, intrinsics = ["# frame qw qx qy qz tx ty tz"], []
+    for number, view in enumerate(views):
+        name, c, T = f"seq1/frame_{number:05d}.jpg", view.frame.intrinsics, np.linalg.inv(matrix(view))
+        write_image(folder / name, pixels(view))
+        x, y, z, w = quaternion(T)
+        poses.append(f"{name} {w} {x} {y} {z} {' '.join(map(repr, T[:3, 3].tolist()))}")
+        intrinsics.append(f"{name} {c.fx} {c.fy} {c.cx} {c.cy} {c.width} {c.height}")
+    (folder / "poses.txt").write_text("\n".join(poses) + "\n")
+    (folder / "intrinsics.txt").write_text("\n".join(intrinsics) + "\n")
+    return folder
+
+
+def write_rtabmap(folder: Path, views: Sequence[View], of_robot: bool = False) -> Path:
+    """With the poses of a robot, whose camera is turned and moved on it."""
+    T_robot_camera = np.eye(4)
+    T_robot_camera[:3] = [[0, 0, 1, 0.1], [-1, 0, 0, 0.02], [0, -1, 0, 0.3]]
+    rows, camera, (cx, cy) = ["#timestamp x y z qx qy qz qw id"], views[0].frame.intrinsics, centre(views[0])
+    (folder / "rtabmap_calib").mkdir(parents=True)
+    for number, view in enumerate(views):
+        stamp, pose = f"{START + PERIOD * number:.6f}", matrix(view)
+        if of_robot:
+            pose = pose @ np.linalg.inv(T_robot_camera)
+        rows.append(" ".join([stamp, *map(repr, [*pose[:3, 3].tolist(), *quaternion(pose)]), str(number + 1)]))
+        write_image(folder / "rtabmap_rgb" / f"{stamp}.jpg", pixels(view))
+        write_image(folder / "rtabmap_depth" / f"{stamp}.png", millimetres(view))
+        (folder / "rtabmap_calib" / f"{stamp}.yaml").write_text(
+            f"%YAML:1.0\n---\nimage_width: {camera.width}\nimage_height: {camera.height}\n"
+            f"camera_matrix:\n   rows: 3\n   cols: 3\n   data: [ {camera.fx}, 0., {cx}, 0., {camera.fy}, {cy}, 0., 0., 1. ]\n"
+            f"local_transform:\n   rows: 3\n   cols: 4\n   data: {T_robot_camera[:3].ravel().tolist()}\n"
+        )
+    (folder / f"rtabmap_{'' if of_robot else 'camera_'}poses.txt").write_text("\n".join(rows) + "\n")
+    return folder
+
+
 class Layout(NamedTuple):
     reader: str
     write: Callable[[Path, Sequence[View]], Path]
@@ -460,6 +537,13 @@ LAYOUTS = {
     "llff": Layout("llff", write_llff, depth=False, unit=None),
     "opensfm": Layout("opensfm", write_opensfm, depth=False, times=True, unit=None),
     "metashape": Layout("metashape", write_metashape, depth=False, unit=None),
+    "ace": Layout("ace", write_ace),
+    "nsvf": Layout("ace", partial(write_ace, nsvf=True)),
+    "cambridge": Layout("cambridge", write_cambridge, depth=False),
+    "vsfm": Layout("cambridge", write_vsfm, depth=False, unit=None),
+    "map-free": Layout("cambridge", write_map_free, depth=False, lossless=False),
+    "rtabmap": Layout("rtabmap", write_rtabmap, times=True, lossless=False),
+    "rtabmap, of a robot": Layout("rtabmap", partial(write_rtabmap, of_robot=True), times=True, lossless=False),
     "transforms": Layout("transforms", write_nerfstudio, unit=None),
     "colmap": Layout("colmap", write_colmap, depth=False, unit=None),
     "colmap, binary": Layout("colmap", partial(write_colmap, binary=True), depth=False, unit=None),

@@ -3,7 +3,8 @@
 Models are looked for in ``sparse``, ``colmap/sparse`` (nerfstudio), the folder itself, ``dense`` and the
 like, as .bin or .txt (``cameras`` and ``images``; ``points3D``, ``rigs`` and ``frames`` are not read). If
 the mapper wrote several (``sparse/0``, ``sparse/1`` ...), the one with the most images is used, with a
-remark. Among the usual image folders, the one that holds most of the model's images is used. Missing images
+remark. Among the usual image folders, the one that holds most of the model's images is used, or else any folder in which they
+are found by name. Missing images
 and photos that are not registered are left out and counted.
 
 In a dense workspace (``images``, ``sparse``, ``stereo/depth_maps``) the depth maps provide the images' depth:
@@ -16,6 +17,7 @@ that was resized after the reconstruction is scaled. COLMAP records no times: a 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
@@ -34,6 +36,7 @@ from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames, posix_nam
 from bidnerf_core.datasets.reader import DatasetOptions, Format
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import natural_order
+from bidnerf_core.io import is_file
 
 MODEL_FOLDERS = (
     "sparse",
@@ -68,7 +71,7 @@ IMAGE_FOLDERS = (
 
 def _read(path: Path, models: list[Path], options: DatasetOptions) -> Capture:
     """Read the project. Raises ``InputError`` if its model is damaged or has no registered image."""
-    model, folder, images, cameras, files = colmap_project(path)
+    model, folder, images, cameras, files = colmap_project(path, options.image_folder)
     if options.masks is None and any((each / "masks").is_dir() for each in (path, folder.parent)):
         warn_about(path, "masks lies beside the images and is not used; name it (`masks`) to use it")
     if folder != path:
@@ -84,15 +87,17 @@ def _read(path: Path, models: list[Path], options: DatasetOptions) -> Capture:
     return Capture(path, shots, options.colour, pose_file=model)
 
 
-def colmap_project(path: Path) -> tuple[Path, Path, list[ModelImage], dict[int, Camera], dict[str, Path]]:
-    """Return the selected model, its image folder, and its images, cameras and image files.
+def colmap_project(
+    path: Path, given: Path | None = None
+) -> tuple[Path, Path, list[ModelImage], dict[int, Camera], dict[str, Path]]:
+    """Return the selected model, its image folder (``given`` by the user or not), and its images, cameras and image files.
 
     Images are in natural name order, cameras are keyed by id, and existing files are keyed by image name.
     Raises ``InputError`` if the model is damaged or has no registered image.
     """
     model, images, cameras = _largest(path, colmap_models(path))
-    folder, files = _image_folder(path, model, images)
-    others = _models_at(folder.parent / "sparse") if files else []
+    folder, files = _image_folder(path, model, images, given)
+    others = _models_at(folder.parent / "sparse") if files and given is None else []
     if others and model.resolve() not in [each.resolve() for each in others]:
         # For example, the images of dense/0 are undistorted, while those of sparse/0 lie elsewhere.
         warn_about(
@@ -100,7 +105,7 @@ def colmap_project(path: Path) -> tuple[Path, Path, list[ModelImage], dict[int, 
             f"{folder.relative_to(path)} has a model of its own, which is used instead of {model.relative_to(path)}",
         )
         model, images, cameras = _largest(path, others)
-        folder, files = _image_folder(path, model, images)
+        folder, files = _image_folder(path, model, images, given)
     if not images:
         raise InputError("has no registered image", where=model, expected="at least one")
     images.sort(key=lambda image: natural_order(str(posix_name(image.name))))
@@ -142,10 +147,15 @@ def _largest(path: Path, models: Sequence[Path]) -> tuple[Path, list[ModelImage]
     return chosen, *read[chosen]
 
 
-def _image_folder(path: Path, model: Path, images: Sequence[ModelImage]) -> tuple[Path, dict[str, Path]]:
-    """Return the folder that holds most of the images, and the image files by their names in the model."""
+def _image_folder(
+    path: Path, model: Path, images: Sequence[ModelImage], given: Path | None
+) -> tuple[Path, dict[str, Path]]:
+    """Return the folder that holds most of the images, and the image files by their names in the model.
+
+    If none of the usual folders holds half of the images, they are looked for below ``path``, or in the ``given`` folder alone.
+    """
     beside = [model.parent / "images", model.parent.parent / "images"]
-    folders = list(dict.fromkeys([*beside, *(path / name for name in IMAGE_FOLDERS)]))
+    folders = list(dict.fromkeys([*beside, *(path / name for name in IMAGE_FOLDERS)])) if given is None else []
     best: tuple[Path, dict[str, Path]] = (path / IMAGE_FOLDERS[0], {})
     for folder in filter(Path.is_dir, folders):
         names = FileNames(folder)
@@ -154,6 +164,11 @@ def _image_folder(path: Path, model: Path, images: Sequence[ModelImage]) -> tupl
             best = folder, files
         if len(files) == len(images):
             break
+    if 2 * len(best[1]) < len(images):
+        names = FileNames(path, images=given)
+        files = {image.name: file for image in images if is_file(file := names.image(image.name))}
+        if len(files) > len(best[1]):
+            best = Path(os.path.commonpath([file.parent for file in files.values()])), files
     return best
 
 
@@ -182,5 +197,6 @@ reader = Format(
     "images with a sparse model in sparse/0 (COLMAP)",
     colmap_models,
     _read,
+    ["images"],
     precedence=20,  # other programs' reconstructions are often made from this one, or lack its lenses
 )

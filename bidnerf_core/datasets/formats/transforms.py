@@ -31,7 +31,7 @@ from typing import get_args
 
 from bidnerf_core.camera import Camera, CameraSource, PanoramaFace, same_aspect
 from bidnerf_core.datasets.capture import Capture, DepthFile, Shot, warn_about
-from bidnerf_core.datasets.file_names import IMAGE_ENDINGS, FileNames
+from bidnerf_core.datasets.file_names import FileNames
 from bidnerf_core.datasets.formats.transforms_json import SPLIT_FILES, FrameRecord, read_splits
 from bidnerf_core.datasets.reader import DatasetOptions, Format
 from bidnerf_core.depth import DepthReader
@@ -43,9 +43,17 @@ from bidnerf_core.io import background_colour, is_file, read_header
 
 def _read(path: Path, files: list[Path], options: DatasetOptions) -> Capture:
     """Read the frames and find their files. Raises ``InputError`` if a file is invalid."""
-    listed, names = read_splits(path), FileNames(path)
-    images = [names.path(frame.file_path, IMAGE_ENDINGS, moved=True) for frame, _ in listed]
-    _check_images(path, [frame for frame, _ in listed], images)
+    listed, names, named = read_splits(path), FileNames(path), FileNames(path, images=options.image_folder)
+    images, owner = (
+        [named.image(frame.record.text("file_path") or "") for frame, _ in listed],
+        dict[Path, FrameRecord](),
+    )
+    for (frame, _), image in zip(listed, images, strict=True):
+        if (other := owner.setdefault(image, frame)).file_path != frame.file_path:
+            raise frame.record.error(
+                "has the image of another frame",
+                expected=f"different images, though {other.file_path} and {frame.file_path} may both be {image}",
+            )
     steps = {frame.depth_unit for frame, _ in listed if frame.depth_path}
     units = {str(frame.record.value("unit")) for frame, _ in listed}  # which bidnerf's own files state
     read_depth, size = DepthReader(), _first_size([frame for frame, _ in listed], images)
@@ -84,24 +92,6 @@ def _read(path: Path, files: list[Path], options: DatasetOptions) -> Capture:
         unit=next((unit for unit in get_args(LengthUnit) if units == {unit}), None),
         depth_unit=options.depth_unit or (steps.pop() if len(steps) == 1 else None),
     )
-
-
-def _check_images(folder: Path, frames: Sequence[FrameRecord], images: Sequence[Path]) -> None:
-    """Issue one remark if names differ from the file names by more than a missing extension.
-
-    Raises ``InputError`` if several different names match the same file.
-    """
-    owner, remarked = dict[Path, FrameRecord](), False
-    for frame, image in zip(frames, images, strict=True):
-        other, written = owner.setdefault(image, frame), frame.record.text("file_path") or ""
-        if other.file_path != frame.file_path:
-            raise frame.record.error(
-                "has the image of another frame",
-                expected=f"different images, though {other.file_path} and {frame.file_path} may both be {image}",
-            )
-        if not remarked and is_file(image) and not str(image).startswith(str(folder / written)):
-            remarked = True
-            warn_about(folder, f"file_path {written!r} is taken for {image.relative_to(folder)}, and others likewise")
 
 
 def _camera(frame: FrameRecord, size: tuple[int, int] | None) -> Camera | CameraSource:
@@ -143,6 +133,6 @@ reader = Format(
     "transforms.json or transforms_train.json, transforms_val.json, transforms_test.json",
     lambda path: [path / name for name in ("transforms.json", *SPLIT_FILES.values()) if is_file(path / name)],
     _read,
-    ["depth_unit"],
+    ["depth_unit", "images"],
     precedence=50,  # datasets of other formats are converted to this one in place
 )

@@ -124,6 +124,7 @@ class BagReader(Reader):
 
     accepts = ("camera",)
     suffixes = SUFFIXES
+    may_lack_poses = True
 
     @property
     def expected(self) -> str:

@@ -1,0 +1,115 @@
+"""Scenes of Cambridge Landmarks (PoseNet), models of VisualSFM, and scenes of Map-free relocalization: lists of images with poses.
+
+``dataset_train.txt`` and ``dataset_test.txt`` have rows of an image's name, the camera's position, and the quaternion (w x y
+z) from world to camera (OpenCV axes, metres). Focal lengths and radial distortion are those of the model of VisualSFM beside
+them, ``reconstruction.nvm``; without it, the camera is the given one or that of EXIF. Without lists, a model (``NVM_V3``: name,
+focal length, quaternion from world to camera, position, radial distortion r) is read by itself, in its own unit. Its lens is
+d (1 + r d²) = u for distorted and undistorted radii d and u in focal lengths, whose inverse is u - r u³ + 3 r² u⁵ - 12 r³ u⁷.
+
+Map-free: ``poses.txt`` has rows of a name, the quaternion (w x y z) and the translation from world to camera (metres), and
+``intrinsics.txt`` rows of the same name, fx, fy, cx, cy, width and height.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+
+import torch
+from scipy.spatial.transform import Rotation
+
+from bidnerf.formats.reality_capture import file_heads
+from bidnerf_core.camera import CameraSource, Intrinsics
+from bidnerf_core.datasets import (
+    Capture,
+    DatasetOptions,
+    FileNames,
+    Format,
+    Shot,
+    camera_of,
+    first_file,
+    pose_numbers,
+)
+from bidnerf_core.errors import InputError
+from bidnerf_core.geometry import SE3
+from bidnerf_core.io import Row, is_file, read_header, read_rows
+
+LISTS = {"train": "dataset_train.txt", "test": "dataset_test.txt"}
+
+
+def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
+    """Read the lists. Raises ``InputError`` if one is invalid."""
+    map_free, model = file.name == "poses.txt", next(iter(sorted(path.glob("*.nvm"))), None)
+    lenses = {_stem(name): (row, numbers) for name, row, numbers in ([] if model is None else _rows(model, 10))}
+    if map_free:
+        lenses = {_stem(name): (row, numbers) for name, row, numbers in _rows(path / "intrinsics.txt", 6)}
+    listed = [
+        (split, *entry) for split, name in LISTS.items() if is_file(path / name) for entry in _rows(path / name, 7)
+    ]
+    if not listed and model is not None:
+        listed = [("", name, row, [*n[5:8], *n[1:5]]) for name, row, n in _rows(model, 10)]
+    if map_free:
+        listed = [("", name, row, [*n[4:], *n[:4]]) for name, row, n in _rows(file, 7)]
+    names, shots = FileNames(path, path / "images", images=options.image_folder), list[Shot]()
+    for split, name, row, numbers in listed:
+        image, found = names.image(name), pose_numbers(row.where, numbers, "wxyz")
+        if found is None:
+            raise row.error(": is no pose")
+        position = torch.tensor(found[:3], dtype=torch.float64)
+        T_camera_world = SE3(torch.from_numpy(Rotation.from_quat(found[3:]).as_matrix()), position)
+        pose = T_camera_world.inverse() if map_free else SE3(T_camera_world.rotation.T, position)
+        lens = None if options.camera_source.is_given else lenses.get(_stem(name))
+        camera = options.camera_source if lens is None or not is_file(image) else CameraSource(_camera(*lens, image))
+        shots.append(Shot(image=image, camera=camera, T_world_camera=pose, splits=(split,) if split else ()))
+    if not shots:
+        raise InputError("lists no images", where=file, expected="rows of a name and a pose")
+    is_model = file.suffix == ".nvm"
+    return Capture(path, shots, options.colour, None if is_model else "metres", pose_file=file)
+
+
+def _find(path: Path) -> Path | None:
+    """Return the first list of images, the model, or the poses of a scene whose intrinsics are listed by image too."""
+    for file, head in file_heads(path, "intrinsics.txt", "a list of cameras"):
+        words = head.partition(b"\n")[0].split()
+        if len(words) == 7 and b"." in words[0] and is_file(file.with_name("poses.txt")):
+            return file.with_name("poses.txt")
+    return first_file(path, *LISTS.values()) or next(iter(sorted(path.glob("*.nvm"))), None)
+
+
+def _rows(file: Path, count: int) -> list[tuple[str, Row, list[float]]]:
+    """Return the rows of a name and ``count`` numbers, each with its name and numbers; a heading is left out."""
+    rows = read_rows(file, "a list of images", f"a name and {count} numbers")
+    if file.suffix == ".nvm":
+        most = next((int(row.text) for row in rows[1:2] if row.text.isdecimal() and len(row.text) < 9), 0)
+        rows = rows[2 : 2 + most]
+    elif rows and rows[0].text.startswith("Visual Landmark Dataset"):
+        rows = rows[2:]
+    found = list[tuple[str, Row, list[float]]]()
+    for row in rows:
+        name, *words = row.text.rsplit(maxsplit=count)
+        if len(words) != count:
+            raise row.error(f" has {len(row.words)} entries")
+        found.append((name, row, row.numbers(words)))
+    return found
+
+
+def _stem(name: str) -> str:
+    return str(PurePosixPath(name.replace("\\", "/")).with_suffix(""))
+
+
+def _camera(row: Row, numbers: list[float], image: Path) -> Intrinsics:
+    if len(numbers) == 6:
+        return camera_of(row.where, numbers[:4], (round(numbers[4]), round(numbers[5])), first_centre=0)
+    header, focal, r = read_header(image), numbers[0], numbers[8]
+    size = header.width, header.height
+    lens = (-r, 3 * r * r, 0.0, 0.0, -12 * r**3)
+    return camera_of(row.where, (focal, focal, size[0] / 2, size[1] / 2), size, lens, first_centre=0)
+
+
+reader = Format(
+    "Cambridge Landmarks, models of VisualSFM (.nvm) and scenes of Map-free relocalization, without depth",
+    "dataset_train.txt with reconstruction.nvm (Cambridge Landmarks), or a .nvm, or poses.txt with intrinsics.txt (Map-free)",
+    _find,
+    _read,
+    ["camera", "focal", "images"],
+    precedence=25,  # lists made from a model, so preferred to it
+)
