@@ -246,6 +246,14 @@ SUPPORT_BOUNDS = (
         Outcome.RENDERING_MISMATCH,
         "the colours differ {0:.1f} times as much as in the map's own images",
     ),
+    Bound("confirmed", 1.0, True, Outcome.TOO_FEW_MATCHES, "hardly any landmarks match, although many are visible"),
+    Bound(
+        "known_focal",
+        1.0,
+        True,
+        Outcome.IMPRECISE,
+        "the focal length is approximate, and only landmarks can separate it from the distance",
+    ),
 )
 """The bounds of a pose without landmarks, the most serious reason first."""
 RIVALS = {

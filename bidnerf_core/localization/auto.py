@@ -16,7 +16,7 @@ import torch
 from bidnerf_core.depth import find_depth_sensor
 from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.accept import Evidence, least_confidence
+from bidnerf_core.localization.accept import Evidence, Support, least_confidence
 from bidnerf_core.localization.by_surface import localize_by_depth, localize_by_images
 from bidnerf_core.localization.explanations import CAMERAS, MOVING
 from bidnerf_core.localization.loop import LandmarkAnswer, Loop
@@ -73,36 +73,34 @@ def _on_surface(
     # If the map's own images usually have 150 matches, an image without recognised landmarks shows something else.
     if surface is None or (loop is not None and loop.landmarks.usual_matches >= 150):
         return best or unrecognized(problem)
-    config = config if loop is None else replace(config, rounds=1)
-    found = localize_by_depth(problem, surface, config, seed)
+    found = localize_by_depth(problem, surface, config if loop is None else replace(config, rounds=1), seed)
+    if found is None and loop is None:
+        found = localize_by_images(problem, surface, config, seed)
     if found is None:
-        if best is None and loop is None:
-            found = localize_by_images(problem, surface, config, seed)
-            return _uncertain_camera(found, problem)
         return best or unrecognized(problem)
     there = None if loop is None else loop.at(found.T_world_camera)
     if there is not None and there.verdict.accepted:
         found = localization_of(problem, there, began)
         return replace(found, reason=f"found on the surface; {found.reason}")
-    if there is not None and found.converged and there.contradicted:
-        why = f"{there.evidence.inliers} landmarks match, {there.evidence.by_chance:.0f} by chance"
-        found = found.rejected(Verdict(Outcome.TOO_FEW_MATCHES, why))
-    found = _uncertain_camera(found, problem)
+    if isinstance(judged := found.diagnostics, Support):
+        # An approximate focal length does not matter to the points of another sensor.
+        by_rays = problem.depth_rays is not None and not any(view.frame.has_depth for view in problem.views)
+        more = {
+            "confirmed": None if there is None else float(not there.contradicted),
+            "known_focal": float(by_rays or not problem.focal_is_approximate),
+        }
+        judged = replace(judged, measures=judged.measures | more)
+        verdict = judged.verdict(found.reason)
+        found = replace(
+            found,
+            outcome=verdict.outcome,
+            reason=verdict.reason,
+            confidence=verdict.confidence,
+            diagnostics=judged,
+        )
     # A landmark-based pose with too few matches is a pose by chance.
     is_better = found.converged or best is None or best.outcome is Outcome.TOO_FEW_MATCHES
     return found if is_better or best is None else best
-
-
-def _uncertain_camera(found: Localization, problem: Problem) -> Localization:
-    """Reject a surface-based pose if the focal length is approximate, unless all depth is from another depth sensor.
-
-    Only landmarks can separate focal length from distance.
-    """
-    by_rays = problem.depth_rays is not None and not any(view.frame.has_depth for view in problem.views)
-    if not found.converged or not problem.focal_is_approximate or by_rays:
-        return found
-    why = "the focal length is approximate, and only landmarks can separate it from the distance"
-    return found.rejected(Verdict(Outcome.IMPRECISE, why))
 
 
 def localization_of(problem: Problem, answer: LandmarkAnswer, began: float) -> Localization:

@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Iterable
 from dataclasses import replace
-from itertools import chain
 
 import torch
 from jaxtyping import Float
@@ -15,7 +14,7 @@ from torch.nn.functional import normalize
 
 from bidnerf_core.devices import move_to
 from bidnerf_core.frames import Frame
-from bidnerf_core.geometry import SE3, random_units, skew
+from bidnerf_core.geometry import SE3, random_units
 from bidnerf_core.localization.accept import Support, support
 from bidnerf_core.localization.problem import Pivot, Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
@@ -25,17 +24,15 @@ from bidnerf_core.localization.search import (
     RayTerms,
     SearchResult,
     Stage,
-    colour_stages,
+    conclude,
     halve,
-    image_stages,
     localization_by_rays,
-    neighbours,
     states_at,
 )
 from bidnerf_core.localization.settings import AutoConfig, ColourSettings, DepthLossSettings
-from bidnerf_core.localization.terms.images import ColourScales, Thumbnail, surface_renderer
+from bidnerf_core.localization.terms.images import ColourScales, Images, Thumbnail, surface_renderer
 from bidnerf_core.localization.terms.surface import Surface
-from bidnerf_core.mapping import States, SurfaceMap, cast, descend, trace
+from bidnerf_core.mapping import GaussianPrior, States, SurfaceMap, cast, descend, trace
 
 ON_SURFACE = 0.02
 """Distance at which a point's inlier weight is one half when poses are compared, as a fraction of the scene's extent."""
@@ -52,8 +49,6 @@ POINT_STAGES = (
 )
 IMAGE_STAGES = ((16, 0, 48), (16, 8, 12), (24, 8, 4), (48, 8, 2), (96, 5, 2))
 """Stages of the search by images: pixels of the longer side, steps, poses kept."""
-DETAILED_STAGES = ((32, 0, 64), (32, 6, 16), (48, 8, 6), (96, 6, 2), (192, 4, 1))
-"""Stages for partly hidden images: in smaller thumbnails, nearly every pixel would contain part of the occluders."""
 
 
 @torch.no_grad()
@@ -96,37 +91,33 @@ def localize_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig,
     covariance, precision = covariance_by_depth(problem, aligned, best, middle)
     rivals = support(lambda T: finest.costs(states_at(T)), T, middle)
     # With the right camera, landmarks should confirm the pose; where they do not, only a precise alignment is accepted.
-    precise = {"runner_up_margin": found.margin, "precision": None if problem.matcher is None else precision}
-    judged = Support({**measures, **rivals, **precise})
-    share = f"{measures['colour_inliers']:.0%}"
-    verdict = judged.verdict(f"{share} of the measured points match the surface in position and colour")
-    first = path[:1] if problem.start is None else problem.start[None]
-    path, loss = SE3.cat([first, path[1:-1], T[None]]), float(compared.costs(best).mean())
-    return Localization.of(verdict, path, losses, "auto", began, loss, covariance, judged)
+    measures |= {
+        **rivals,
+        "runner_up_margin": found.margin,
+        "precision": None if problem.matcher is None else precision,
+    }
+    words = f"{measures['colour_inliers']:.0%} of the measured points match the surface in position and colour"
+    loss = float(compared.costs(best).mean())
+    return conclude(problem, SE3.cat([path[:-1], T[None]]), losses, Support(measures), words, began, loss, covariance)
 
 
 def localize_by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int) -> Localization:
     """Localize by comparing the images with renderings of the surface, in rounds until an answer is accepted.
 
-    Each answer is refined on rays rendered from the field. The first round is fast; later rounds assume that part of the scene is occluded.
-    If no answer is accepted, the one with the smallest loss is returned.
+    Each answer is refined on rays rendered from the field. If no answer is accepted, the one with the smallest loss is returned.
     """
     began, steps, answers = time.perf_counter(), config.by_colour, list[Localization]()
-    problem, terms, least = problem.without_depth(), RayTerms(steps.colour, None), steps.converged_inliers
+    problem, terms = problem.without_depth(), RayTerms(config.by_colour.colour, None)
     if all(is_blank(view.frame) for view in problem.views):
         why = Verdict(Outcome.UNDETERMINED, "the image has a single colour, as if the lens were covered")
         path = (problem.start or SE3.identity())[None]
         return Localization.of(why, path, torch.zeros(0, dtype=torch.float64), "auto", began, math.nan)
     for number in range(config.rounds):
-        stages = colour_stages(problem, terms, steps, seed)
-        if number > 0:
-            # If half of the rays are outliers, refinement on few rays or at a coarse level drifts away from the true pose.
-            robust = RayTerms(replace(steps.colour, colour_loss="geman-mcclure"), None)
-            rays = robust.term(problem, 4 * steps.fine_rays, seed, wide=0.5, sigma=COLOUR_SIGMA / 2)
-            stages = iter([Stage([rays], steps.fine_steps, 1)])
-        found, middle = by_images(problem, surface, config.hypotheses, seed + number, number > 0, stages)
-        fresh = terms.term(problem, steps.fine_rays, seed + 2, sigma=COLOUR_SIGMA / 2)
-        answers.append(localization_by_rays(problem, found, fresh, middle, least, "auto", began))
+        coarse = terms.term(problem, steps.fine_rays // 4, seed, level=0, blur=2, sigma=COLOUR_SIGMA)
+        fine, fresh = (terms.term(problem, steps.fine_rays, seed + more, sigma=COLOUR_SIGMA / 2) for more in (1, 2))
+        later = [Stage([coarse], min(4, steps.fine_steps), 2), Stage([fine], steps.fine_steps, 1)]
+        found, middle = by_images(problem, surface, config.hypotheses, seed + number, later)
+        answers.append(localization_by_rays(problem, found, fresh, middle, steps.converged_inliers, began))
         if answers[-1].converged:
             break
     return min(answers, key=lambda answer: (not answer.converged, answer.loss))
@@ -148,13 +139,12 @@ def by_depth(problem: Problem, points: Surface, count: int, seed: int) -> Search
 
 
 def by_images(
-    problem: Problem, surface: SurfaceMap, count: int, seed: int, detailed: bool = False, later: Iterable[Stage] = ()
+    problem: Problem, surface: SurfaceMap, count: int, seed: int, later: Iterable[Stage] = ()
 ) -> tuple[SearchResult, Float[Tensor, "3"]]:
     """Compare the images with renderings of the surface from ``count`` hypotheses throughout the scene, then run ``later`` stages.
 
     Returns the result, best pose first, and the middle of the visible scene (metres, last camera's frame). Rays cast from keyframes give
-    the typical distance of the scene, and whether it has a background. ``detailed`` is for partly occluded images: colour scales are
-    narrow, as wider ones favour poses that partly explain the occluders' colours, and the exposure stays close to the map's.
+    the typical distance of the scene, and whether it has a background.
     """
     small = move_to(Thumbnail.of(problem.views[-1], 16), surface.device)
     keyframes = SE3.from_matrix(surface.keyframes[:: max(1, len(surface.keyframes) // 16)]).to(small.flat)
@@ -166,12 +156,13 @@ def by_images(
     # A map has a background if more than a fifth of the keyframes' rays hit nothing.
     background = problem.bounds.background if float(seen.met.float().mean()) < 1 - 0.2 else None
     renderer = surface_renderer(surface, background)
-    # Wide scales cope with images exposed twice or half as long as the map's.
-    scales = ColourScales(colour=0.07) if detailed else ColourScales(gain=1.0, rounds=5)
-    sizes = DETAILED_STAGES if detailed else IMAGE_STAGES
+    stages = []
+    for width, steps, keep in IMAGE_STAGES:
+        thumbnails = [move_to(Thumbnail.of(view, width), surface.device) for view in problem.views]
+        # Wide scales cope with images exposed twice or half as long as the map's.
+        stages.append(Stage([Images(renderer, thumbnails, ColourScales(gain=1.0, rounds=5))], steps, keep))
     start = states_at(hypotheses(surface, problem.start, middle, count, False, seed))
-    stages = chain(image_stages(problem, renderer, surface.device, scales, sizes), later)
-    return halve(start, stages, middle, surface.device), middle
+    return halve(start, [*stages, *later], middle, surface.device), middle
 
 
 def hypotheses(
@@ -206,7 +197,7 @@ def hypotheses(
     if by_points:
         centre = surface.surfels.positions.median(0).values.cpu().double()
         others = SE3(others.rotation, centre - others.rotation @ middle)
-    around = [] if start is None else [neighbours(start, near, 0.1 * surface.extent, 0.25, seed)]
+    around = [] if start is None else [start[None], displace(SE3.stack([start] * near)[1:], 0.1, 0.25)]
     return SE3.cat([*around, displace(keyframes[order[near:half]], 0.02, 0.05), others])
 
 
@@ -244,10 +235,8 @@ def covariance_by_depth(
     deviation of the position without these shared errors, relative to the distance of the points.
     """
     unconstrained = torch.tensor([points.surface.extent] * 3 + [math.pi] * 3, dtype=torch.float64)
-    about = torch.eye(6, dtype=torch.float64)
-    about[:3, 3:] = skew(middle)
-    hessian = about.mT @ points(best).hessian[0, :6, :6] @ about + unconstrained.square().reciprocal().diag()
-    found = about @ torch.linalg.inv(hessian) @ about.mT
+    anywhere = GaussianPrior(best.T[0], unconstrained.square().reciprocal().diag())
+    found = torch.linalg.inv((points(best) + anywhere(best)).hessian[0, :6, :6])
     precision = float(found[:3, :3].trace().sqrt() / middle.norm())
     sight = normalize((points.points - points.sights.translation).cpu(), dim=-1).mean(0)
     shared = torch.stack([problem.sensor.scale * middle, problem.sensor.offset * sight], -1)

@@ -5,13 +5,12 @@ A search ends with steps on rendered rays: at first few rays at the coarsest lev
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.quasirandom import SobolEngine
 
 from bidnerf_core.devices import move_to, without_waiting
 from bidnerf_core.errors import amount
@@ -22,11 +21,9 @@ from bidnerf_core.localization.result import Localization, current_record
 from bidnerf_core.localization.settings import (
     ColourSettings,
     DepthLossSettings,
-    RefinementSettings,
     mean_side,
     rendered_depth_scale,
 )
-from bidnerf_core.localization.terms.images import ColourScales, Images, Renderer, Thumbnail
 from bidnerf_core.localization.terms.rays import ALONE, RenderedRays
 from bidnerf_core.mapping import CostTerm, States, damped_solution, descend
 from bidnerf_core.progress import check_cancelled
@@ -100,36 +97,10 @@ def halve(
     return move_to(SearchResult(states, scores, margin, rivals, before, path_poses, path_losses), "cpu")
 
 
-def image_stages(
-    problem: Problem,
-    renderer: Renderer,
-    device: torch.device,
-    scales: ColourScales,
-    stages: Sequence[tuple[int, int, int]],
-) -> Iterator[Stage]:
-    """Yield the ``stages`` of a search with small images, given as pixels of the longer side, steps, and poses to keep."""
-    for width, steps, keep in stages:
-        thumbnails = [move_to(Thumbnail.of(view, width), device) for view in problem.views]
-        yield Stage([Images(renderer, thumbnails, scales)], steps, keep)
-
-
 def states_at(T: SE3) -> States:
     """Return static states with known cameras at the poses ``T`` (h)."""
     one = States.known(SE3.identity(), torch.zeros(6, dtype=torch.float64))
     return replace(one[torch.zeros(len(T.translation), dtype=torch.long)], T=T.to("cpu", torch.float64))
-
-
-def neighbours(T: SE3, count: int, translation: float, rotation: float, seed: int) -> SE3:
-    """Return ``T`` and ``count`` - 1 right updates of ``T``, quasi-random samples of a normal distribution.
-
-    ``translation`` (metres) and ``rotation`` (radians) are the standard deviations along and about each axis of the camera;
-    the samples are a Sobol sequence, scrambled with ``seed``. Shape (count).
-    """
-    even = SobolEngine(6, scramble=True, seed=seed).draw(count, dtype=torch.float64)
-    size = torch.tensor([translation] * 3 + [rotation] * 3, dtype=torch.float64)
-    xi = size * torch.special.ndtri(even.clamp(1e-6, 1 - 1e-6))
-    xi[0] = 0
-    return SE3(T.rotation[None], T.translation[None]).retract(xi)
 
 
 @dataclass(frozen=True)
@@ -147,32 +118,23 @@ class RayTerms:
         seed: int,
         level: int | None = None,
         blur: int = 1,
-        wide: float = 1.0,
         sigma: float = 0.0,
     ) -> RenderedRays:
         """Draw ``count`` rays; return their residual term at a level of the field (0 is the coarsest, None the field itself).
 
-        Observed colours are averaged over squares of ``blur`` pixels. ``wide`` multiplies the scales of the losses, and ``sigma``
-        is the uncertainty of the map's surfaces, relative to the scene's mean side.
+        Observed colours are averaged over squares of ``blur`` pixels. ``sigma`` is the uncertainty of the map's surfaces, relative to the scene's mean side.
         """
         depth, bounds = self.depth, problem.bounds
         if depth is not None and (depth.depth_weight == 0 or not problem.has_depth):
             depth = None
         own = None if depth is None else problem.depth_rays
         drawn = RenderedRays.of(problem.views, problem.level(level), bounds, max(7, count), seed, blur, own)
-        loss = Robust(self.colour.colour_loss, wide * self.colour.colour_scale)
+        loss = Robust(self.colour.colour_loss, self.colour.colour_scale)
         found = replace(drawn, loss=loss, exposure=self.exposure, sigma=sigma * mean_side(bounds))
         if depth is None:
             return found
         scale = depth.depth_scale or rendered_depth_scale(bounds) / 2
-        return replace(found, depth_loss=Robust(depth.depth_loss, wide * scale), depth_weight=depth.depth_weight)
-
-
-def colour_stages(problem: Problem, terms: RayTerms, steps: RefinementSettings, seed: int) -> Iterator[Stage]:
-    """Yield two stages: few rays at the coarsest level from each pose, then full detail from the two best, keeping the better."""
-    coarse = terms.term(problem, steps.fine_rays // 4, seed, level=0, blur=2, sigma=COLOUR_SIGMA)
-    yield Stage([coarse], min(4, steps.fine_steps), 2)
-    yield Stage([terms.term(problem, steps.fine_rays, seed + 1, sigma=COLOUR_SIGMA / 2)], steps.fine_steps, 1)
+        return replace(found, depth_loss=Robust(depth.depth_loss, scale), depth_weight=depth.depth_weight)
 
 
 def localization_by_rays(
@@ -181,7 +143,6 @@ def localization_by_rays(
     fresh: RenderedRays,
     middle: Float[Tensor, "3"],
     least_inliers: float,
-    method: str,
     began: float,
 ) -> Localization:
     """Accept or reject the best pose of a search, using rays to which the pose was not fitted.
@@ -211,12 +172,24 @@ def localization_by_rays(
         "further_step": float(torch.cat([shift / middle.norm(), step[3:]]).norm()),
         "colour_ratio": float(here.colour_noise()[0]) / by_colour if by_colour else None,
     }
-    compared = Support(measures, {"new_inliers": least_inliers})
-    verdict = compared.verdict(f"{agreement:.0%} of newly drawn rays agree with the measurements")
-    path = found.path if problem.start is None else SE3.cat([problem.start[None], found.path[1:]])
-    path = SE3.cat([path[:-1], T[None]])
+    words = f"{agreement:.0%} of newly drawn rays agree with the measurements"
+    path = SE3.cat([found.path[:-1], T[None]])
     loss = float(normal.cost) * float(rays.noise) ** 2 / rays.independent
-    covariance = (covariance + covariance.mT) / 2
-    return Localization.of(
-        verdict, path, found.losses, method, began, loss, covariance if determined else None, compared
-    )
+    known = (covariance + covariance.mT) / 2 if determined else None
+    judged = Support(measures, {"new_inliers": least_inliers})
+    return conclude(problem, path, found.losses, judged, words, began, loss, known)
+
+
+def conclude(
+    problem: Problem,
+    path: SE3,
+    losses: Float[Tensor, "s"],
+    judged: Support,
+    accepted: str,
+    began: float,
+    loss: float,
+    covariance: Float[Tensor, "6 6"] | None,
+) -> Localization:
+    """Return the answer at the end of a search's ``path``; the path begins at the start, if there is one. ``accepted`` is the reason."""
+    path = path if problem.start is None else SE3.cat([problem.start[None], path[1:]])
+    return Localization.of(judged.verdict(accepted), path, losses, "auto", began, loss, covariance, judged)

@@ -115,8 +115,7 @@ class RefinementSettings(Settings):
     """Settings of second-order steps on rendered rays from coarse to fine, and of their acceptance by newly drawn rays."""
 
     fine_steps: Annotated[int, Range(1, 10**5)] = 8  # steps of the best pose, in full detail
-    # number of rays rendered for each of the fine steps, and of fractions of it before; in ``auto``, four times as many if part of
-    # the scene may be hidden
+    # number of rays rendered for each of the fine steps, and of fractions of it before
     fine_rays: Annotated[int, Range(7, 10**7)] = 1024
     colour: ColourSettings = ColourSettings()
     converged_inliers: NotNegative = 0.93  # minimum inlier fraction of the rays for an accepted pose

@@ -15,7 +15,7 @@ from bidnerf_core.localization import states_at
 from bidnerf_core.localization.by_surface import by_images, hypotheses
 
 # Inside: the distribution of proposals and the margin over other poses, of which an answer keeps one
-from bidnerf_core.localization.search import Stage, halve, neighbours
+from bidnerf_core.localization.search import Stage, halve
 from bidnerf_core.mapping import Normal, P, States
 
 PLACES = torch.tensor([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]], dtype=torch.float64)
@@ -84,15 +84,6 @@ def test_hypotheses_are_distinct_and_begin_at_a_start(count: int, by_points: boo
         last = hypotheses(surface, None, middle, 40, True, 0)[20:].apply(middle.double())
         centre = surface.surfels.positions.median(0).values.double()
         torch.testing.assert_close(last, centre.expand(20, 3), rtol=0, atol=1e-6)
-
-
-def test_neighbours_are_even_and_hold_the_start() -> None:
-    T = baked.unseen()[0].T_ref_camera
-    xi = (T[None].inverse() @ neighbours(T, 512, 0.2, 0.1, seed=0)).log()
-    assert float(xi[0].abs().max()) < 1e-9
-    expected = torch.tensor([0.2] * 3 + [0.1] * 3, dtype=torch.float64)
-    torch.testing.assert_close(xi.std(0), expected, rtol=0.1, atol=0)
-    assert float(xi.mean(0).abs().max()) < 0.01
 
 
 def test_images_find_the_pose_without_depth() -> None:
