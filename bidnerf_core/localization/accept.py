@@ -246,6 +246,22 @@ SUPPORT_BOUNDS = (
         Outcome.RENDERING_MISMATCH,
         "the colours differ {0:.1f} times as much as in the map's own images",
     ),
+    # A squared Mahalanobis distance: five standard deviations.
+    Bound(
+        "innovation",
+        25.0,
+        False,
+        Outcome.AMBIGUOUS,
+        "the measurements fit a place that is inconsistent with the motion",
+    ),
+    Bound("timed", 1.0, True, Outcome.IMPRECISE, "without a time stamp the motion is unknown"),
+    Bound(
+        "beside_images",
+        4.5,
+        False,
+        Outcome.IMPRECISE,
+        "the position is uncertain by {0:.1f} times the usual error of the map's own images",
+    ),
     Bound("confirmed", 1.0, True, Outcome.TOO_FEW_MATCHES, "hardly any landmarks match, although many are visible"),
     Bound(
         "known_focal",

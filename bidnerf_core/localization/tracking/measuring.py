@@ -302,7 +302,8 @@ class Measurer:
             for _ in range(2):
                 states, normal = descend(states, [prediction, rays.fitted(states)], 2)
             share = float(rays.agreement(states))
-            measured, words = Support({"new_inliers": share}), f"{share:.0%} of the rays have the rendered colours"
+            measures: dict[str, float | None] = {"new_inliers": share}
+            words = f"{share:.0%} of the rays have the rendered colours"
         else:
             points = replace(points, colour_weight=float(image is not None))
             # At first, the robust loss is three times as wide as suits the residuals. The start is close, so that few steps suffice.
@@ -315,28 +316,24 @@ class Measurer:
             # The inlier weight of a point is one half at a distance of four cells from the surface.
             near, alike = replace(points, noise=2 * points.surface.cell).inliers(states)
             share, colours = float(near.mean()), None if image is None else float((near * alike).mean())
-            measured = Support({"on_surface": share, "colour_inliers": colours})
+            measures = {"on_surface": share, "colour_inliers": colours}
             words = f"{share:.0%} of the measured points lie on the surface"
         information = (normal - prediction(states)).hessian[0, :6, :6]
         motion = predicted.refine(states.T[0].polished(), information)
         deviation = _position_deviation(motion.covariance)
         moved = update_between(predicted.T_world_camera, motion.T_world_camera)
-        typical = 0.0 if self.landmarks is None else self.landmarks.trial.translation
-        verdict, objection = measured.verdict(words), None
-        # The pose must be within five standard deviations of the prediction (a squared Mahalanobis distance).
-        if float(moved @ torch.linalg.solve(covariance, moved)) > 25:
-            objection = Outcome.AMBIGUOUS, "the measurements fit a place that is inconsistent with the motion"
-        elif image is None and not state.clock.stamped:
-            objection = Outcome.IMPRECISE, f"{words}, but without a time stamp the motion is unknown"
-        elif deviation > TOLERANCE * reach:
-            objection = Outcome.IMPRECISE, f"{words}, but the position is uncertain by {deviation:.3g}"
+        measures |= {
+            "innovation": float(moved @ torch.linalg.solve(covariance, moved)),
+            "timed": None if image is not None else float(state.clock.stamped),
+            "precision": deviation / reach,
+        }
         # Without colours, the position is bounded in terms of the median error of the map's own images.
-        elif image is None and typical and deviation > 4.5 * typical:
-            why = f"{words}, but the position is uncertain by {deviation:.3g}, images by {typical:.3g}"
-            objection = Outcome.IMPRECISE, why
-        if objection is not None and verdict.accepted:
-            verdict = Verdict(*objection)
-        return Measurement.of(predicted, motion, verdict, 1 - share, state, measured)
+        if image is None and self.landmarks is not None and self.landmarks.trial.translation:
+            measures["beside_images"] = deviation / self.landmarks.trial.translation
+        measured = Support(measures, {"precision": TOLERANCE})
+        verdict = measured.verdict("")
+        reason = words if verdict.accepted else f"{words}, but {verdict.reason}"
+        return Measurement.of(predicted, motion, replace(verdict, reason=reason), 1 - share, state, measured)
 
     def odometry(
         self, frame: Frame, corners: Points, motion: Motion, predicted: Motion, seconds: float
