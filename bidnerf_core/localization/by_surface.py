@@ -206,7 +206,7 @@ def for_comparison(points: Surface) -> Surface:
     return replace(points, noise=ON_SURFACE / 2 * points.surface.extent, colour_weight=1.0)
 
 
-def measure_support(points: Surface, best: States) -> dict[str, float]:
+def measure_support(points: Surface, best: States) -> dict[str, float | None]:
     """Return the measures of ``Support`` for the points at one pose; each point counts with its inlier weight.
 
     Points without a colour are left out of the colour inliers, unless no point has a colour.
