@@ -43,30 +43,30 @@ if TYPE_CHECKING:
 def run_info(
     map: MapFolder,
     json: Json = False,
-    draw: Annotated[Path | None, Option("PNG", "file for a picture of the capture from above", "no picture")] = None,
+    plot: Annotated[Path | None, Option("PNG", "file for a picture of the capture from above", "no picture")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Describe a map and the photos it was built from.
 
     The whole map is loaded, so that damage is detected.
     """
-    if draw is not None:
-        if draw.suffix.lower() != ".png":
-            raise UsageError(where=draw, expected="the name of a PNG file")
-        check_output(draw, (), overwrite)
+    if plot is not None:
+        if plot.suffix.lower() != ".png":
+            raise UsageError(where=plot, expected="the name of a PNG file")
+        check_output(plot, (), overwrite)
     from bidnerf.results import draw_capture
     from bidnerf_core.maps import load_map
 
     scene = load_map(map)
-    if draw is not None:
+    if plot is not None:
         if scene.capture is None:
             raise InputError(
                 "has no record of its photos to draw; 'bidnerf bake MAP --data DATA' creates one", where=map
             )
         seen_by = None if scene.landmarks is None else scene.landmarks.views
         points = None if scene.landmarks is None else scene.landmarks.positions
-        draw_capture(scene.capture, points, seen_by, draw, scene.unit)
-        say(f"{draw}: written")
+        draw_capture(scene.capture, points, seen_by, plot, scene.unit)
+        say(f"{plot}: written")
     summary = scene.describe()
     print_result(summary.plain(), str(summary).splitlines(), json)
 

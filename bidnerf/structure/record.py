@@ -65,7 +65,7 @@ class FoundPoses:
         return (
             f"{self.contradicting} of {self.sure_pairs} pairs of photos that share many keypoints"
             f" ({self.contradicting / self.sure_pairs:.1%}) contradict the poses found: they show repeated details, or places that"
-            " look alike were taken for one. Check the cameras ('bidnerf info MAP --draw PNG'); if they are wrong, give poses from"
+            " look alike were taken for one. Check the cameras ('bidnerf info MAP --plot PNG'); if they are wrong, give poses from"
             " a phone app, or photos of a smaller part"
         )
 

@@ -136,7 +136,7 @@ def summary(report: CaptureReport) -> list[str]:
     """Return at most ``SUMMARY_LINES`` lines of the report; if some were left out, the last line gives their number."""
     lines = sentences(report)
     left = len(lines) - SUMMARY_LINES + 1
-    more = f"{left} more remarks: 'bidnerf info' prints them all, and 'bidnerf info --draw' plots the capture"
+    more = f"{left} more remarks: 'bidnerf info' prints them all, and 'bidnerf info --plot' plots the capture"
     return lines if left <= 1 else [*lines[: SUMMARY_LINES - 1], more]
 
 

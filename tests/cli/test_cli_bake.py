@@ -96,7 +96,7 @@ def _landmarks_only(sharp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_baked_map_needs_no_start(sharp: Path, baked: Path, once: CommandResult, bidnerf: Run) -> None:
     data, folder, err = sharp / "data", baked, once.err
-    unbaked = bidnerf("info", sharp / "map", "--draw", folder.parent / "capture.png")
+    unbaked = bidnerf("info", sharp / "map", "--plot", folder.parent / "capture.png")
     assert_refused(unbaked, 1, "no record of its photos")
     assert once.out == ""
     assert "from 16 measured views" in err
@@ -119,11 +119,11 @@ def test_a_baked_map_needs_no_start(sharp: Path, baked: Path, once: CommandResul
     # Baking the photos has left a record of them.
     (line,) = [line for line in err.splitlines() if "16 photos, " in line and "horizon" in line]
     assert len(facts["capture"]["photos"]) == 16
-    status, out, err = bidnerf("info", folder, "--draw", folder.parent / "capture.png")
+    status, out, err = bidnerf("info", folder, "--plot", folder.parent / "capture.png")
     assert (status, line in out) == (0, True)
     assert "capture.png: written" in err
     assert (folder.parent / "capture.png").read_bytes().startswith(b"\x89PNG")
-    assert_refused(bidnerf("info", folder, "--draw", folder.parent / "capture.jpg"), 1, "PNG")
+    assert_refused(bidnerf("info", folder, "--plot", folder.parent / "capture.jpg"), 2, "PNG")
 
 
 @pytest.mark.usefixtures("_ball")

@@ -136,6 +136,31 @@ def test_help_names_what_is_installed(bidnerf: Run) -> None:
         assert ", ".join(info.name for info in list_plugins(group)) in page
 
 
+WRITTEN = {"--out", "--data", "--size"}
+"""Options whose placeholder says what the command writes, or how many it reads."""
+WITHOUT = {
+    "--json": {"demo", "report", "serve", "view"},  # whose result is a page, a service or pictures
+    "--device": {"backends", "demo", "export", "info", "plugins", "poses", "report", "scale"},  # which compute no field
+    "--overwrite": {"backends", "bake", "evaluate", "extend", "plugins", "report", "serve"},  # which go on, or add
+}
+
+
+def test_an_option_means_one_thing_and_is_wherever_it_makes_sense() -> None:
+    bundled = [name for name in COMMANDS if COMMANDS[name].__module__.startswith("bidnerf.")]
+    meanings, commands = dict[str, set[Any]](), dict[str, set[str]]()
+    for name in bundled:
+        for parameter, _ in parser._leaves(COMMANDS[name], {}):
+            if not parameter.option.positional and parameter.note(SettingsGroup) is None:
+                many, _, placeholder = parser.conversion(parameter.hint, parameter.notes)
+                meanings.setdefault(parameter.flag, set()).add((many, parameter.option.metavar or placeholder))
+                commands.setdefault(parameter.flag, set()).add(name)
+    assert {flag: each for flag, each in meanings.items() if len(each) > 1 and flag not in WRITTEN} == {}
+    assert {flag: {*bundled} - commands[flag] for flag in WITHOUT} == WITHOUT
+    assert commands["--focal"] == commands["--hfov"] == {"localize", "poses", "track", "train", "view"}
+    assert commands["--frame"] == {"compare", "evaluate", "localize", "render", "view"}
+    assert commands["--camera"] - {"poses"} == commands["--split"]
+
+
 @pytest.mark.parametrize("columns", ["1", "39"])
 def test_help_ends_in_a_narrow_terminal(bidnerf: Run, monkeypatch: pytest.MonkeyPatch, columns: str) -> None:
     monkeypatch.setenv("COLUMNS", columns)

@@ -66,7 +66,7 @@ def test_the_table_is_complete() -> None:
         "report",
         "compare",
         "view MAP --save page.txt",
-        "info MAP --draw page.pdf",
+        "info MAP --plot page.pdf",
         "plugins guess",
     ],
 )
