@@ -149,13 +149,13 @@ def parse(command: str, target: Callable[..., T], arguments: Sequence[str]) -> T
         sys.stdout.write(_Parser(command, target, {}, short=True).format_help())
         raise SystemExit(0)
     loaded = dict[str, Any]()  # the default settings that depend on other arguments, by parameter name
-    pending = {p.name: note for p, note in _leaves(target, {}) if isinstance(note, SettingsGroup)}
+    pending = {p.name: note for p, note in leaves(target, {}) if isinstance(note, SettingsGroup)}
     if pending:
         first = _Parser(command, target, {}, options_only=True)
         given = vars(first.parse_known_args(_escape(words))[0])
         if not pages and first.unknown_option(words) is None:  # else it may be one of the settings
             _Parser(command, target, {}).parse_all(words)  # refuses what is missing before settings are loaded
-        values = {p.name: p.default for p, _ in _leaves(target, {})} | given
+        values = {p.name: p.default for p, _ in leaves(target, {})} | given
         loaded = {name: note.load(values, words) for name, note in pending.items()}
     parser = _Parser(command, target, loaded)
     if pages:
@@ -164,7 +164,7 @@ def parse(command: str, target: Callable[..., T], arguments: Sequence[str]) -> T
     return _build(target, parser.parse_all(words), loaded)
 
 
-def _leaves(
+def leaves(
     target: Any,
     loaded: Mapping[str, Any],
     default: Any = None,
@@ -179,7 +179,7 @@ def _leaves(
             parameter = dataclasses.replace(parameter, default=getattr(default, parameter.name))
         own, nested = parameter.note(Group) or group, loaded.get(parameter.name, parameter.default)
         if dataclasses.is_dataclass(nested):
-            yield from _leaves(type(nested), loaded, nested, parameter.left_out, own)
+            yield from leaves(type(nested), loaded, nested, parameter.left_out, own)
         else:
             yield parameter, own
 
@@ -242,7 +242,7 @@ class _Parser(argparse.ArgumentParser):
         self._required = dict[str, bool]()  # the arguments in messages, and whether they are options
         groups, others = dict[Group | None, Any](), dict[str, None]()
         groups[None] = self.add_argument_group("options")
-        for parameter, group in _leaves(target, loaded):
+        for parameter, group in leaves(target, loaded):
             if isinstance(group, SettingsGroup) and parameter.note(SettingsGroup) is group:  # not loaded
                 others[f"the {group.title}"] = None
             elif short and parameter.note(Expert) is not None:

@@ -24,7 +24,7 @@ from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.io import output_folder, write_file
 from bidnerf_core.localization import origin_of
 from bidnerf_core.mapping import LandmarkMap
-from bidnerf_core.maps import Map, load_map
+from bidnerf_core.maps import Map, load_info, load_map
 from bidnerf_core.registry import Plugins, interface_defects
 
 log = logging.getLogger("bidnerf")
@@ -32,7 +32,8 @@ log = logging.getLogger("bidnerf")
 Exporter: TypeAlias = Callable[[Map, Path], Sequence[Path]]
 """A function that writes a map, whose surface and landmarks are on the CPU, into an existing folder and returns the files.
 
-Before writing anything, it raises ``InputError`` for a map that lacks what the format needs.
+Before writing anything, it raises ``InputError`` for a map that lacks what the format needs. Its attribute ``needs``, if it has one,
+names parts ("surface", "landmarks") without which no map is loaded.
 """
 
 
@@ -66,6 +67,10 @@ def export_map(scene: Map | str | Path, out: str | Path, to: str, overwrite: boo
     if to not in EXPORTERS:
         raise UsageError(f"format {to!r}", expected=f"one of {', '.join(EXPORTERS)}")
     write, out = EXPORTERS[to], Path(out)
+    info = scene.info if isinstance(scene, Map) else load_info(Path(scene))
+    for part in () if isinstance(scene, Map) else getattr(write, "needs", ()):
+        if getattr(info, part) is None:
+            raise InputError(f"has no {part}, which {to!r} needs; 'bidnerf bake' adds one", where=scene)
     with output_folder(out, overwrite):
         scene = (scene if isinstance(scene, Map) else load_map(scene)).whole()
         surface = None if scene.surface is None else scene.surface.to("cpu")

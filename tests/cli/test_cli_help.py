@@ -139,9 +139,28 @@ def test_help_names_what_is_installed(bidnerf: Run) -> None:
 WRITTEN = {"--out", "--data", "--size"}
 """Options whose placeholder says what the command writes, or how many it reads."""
 WITHOUT = {
-    "--json": {"demo", "report", "serve", "view"},  # whose result is a page, a service or pictures
-    "--device": {"backends", "demo", "export", "info", "plugins", "poses", "report", "scale"},  # which compute no field
-    "--overwrite": {"backends", "bake", "evaluate", "extend", "plugins", "report", "serve"},  # which go on, or add
+    "--json": {"completion", "demo", "report", "serve", "view"},  # whose result is a page, a service or pictures
+    "--device": {
+        "backends",
+        "completion",
+        "demo",
+        "export",
+        "info",
+        "plugins",
+        "poses",
+        "report",
+        "scale",
+    },  # which compute no field
+    "--overwrite": {
+        "backends",
+        "bake",
+        "completion",
+        "evaluate",
+        "extend",
+        "plugins",
+        "report",
+        "serve",
+    },  # which go on, or add
 }
 
 
@@ -149,7 +168,7 @@ def test_an_option_means_one_thing_and_is_wherever_it_makes_sense() -> None:
     bundled = [name for name in COMMANDS if COMMANDS[name].__module__.startswith("bidnerf.")]
     meanings, commands = dict[str, set[Any]](), dict[str, set[str]]()
     for name in bundled:
-        for parameter, _ in parser._leaves(COMMANDS[name], {}):
+        for parameter, _ in parser.leaves(COMMANDS[name], {}):
             if not parameter.option.positional and parameter.note(SettingsGroup) is None:
                 many, _, placeholder = parser.conversion(parameter.hint, parameter.notes)
                 meanings.setdefault(parameter.flag, set()).add((many, parameter.option.metavar or placeholder))
@@ -159,6 +178,17 @@ def test_an_option_means_one_thing_and_is_wherever_it_makes_sense() -> None:
     assert commands["--focal"] == commands["--hfov"] == {"localize", "poses", "track", "train", "view"}
     assert commands["--frame"] == {"compare", "evaluate", "localize", "render", "view"}
     assert commands["--camera"] - {"poses"} == commands["--split"]
+
+
+def test_a_shell_completes_commands_and_options(bidnerf: Run) -> None:
+    script = bidnerf("completion", "bash").succeed().out
+    for words, expected in ((["bidnerf", "loc"], ["localize"]), (["bidnerf", "track", "--ri"], ["--risk"])):
+        asked = f'COMP_WORDS=({" ".join(words)}); COMP_CWORD={len(words) - 1}; _bidnerf; echo "${{COMPREPLY[@]}}"'
+        done = subprocess.run(["bash", "-c", f"{script}\n{asked}"], capture_output=True, text=True, check=True)
+        assert (done.stdout.split(), done.stderr) == (expected, "")
+    assert bidnerf("completion", "zsh").succeed().out.endswith(script)
+    fish = bidnerf("completion", "fish").succeed().out
+    assert "'__fish_seen_subcommand_from track' -l risk\n" in fish
 
 
 @pytest.mark.parametrize("columns", ["1", "39"])

@@ -29,6 +29,8 @@ from bidnerf.cli.signals import Interrupted, defer_interruptions, interruptions
 from bidnerf.results import Answers
 from bidnerf_core.datasets import DatasetFrames, Query, read_trajectory
 from bidnerf_core.errors import UsageError
+from bidnerf_core.maps import Map
+from bidnerf_core.registry import registered
 from bidnerf_core.progress import check_cancelled
 from commands import Run, assert_refused
 from flights import flight
@@ -323,6 +325,29 @@ def test_a_file_that_exists_is_replaced_only_if_the_user_says_so(bidnerf: Run, f
     for words in (["localize", "MAP", photo, "--out"], ["track", "MAP", photo, "--out"]):
         assert_refused(bidnerf(*words, out), 1, out, "exists already", "--overwrite")
         assert "exists already" not in bidnerf(*words, out, "--overwrite").err
+
+
+def test_what_a_format_or_a_page_needs_is_checked_before_a_map_is_loaded(
+    bidnerf: Run, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write(scene: Map, out: Path) -> list[Path]:
+        """A mesh."""
+        raise AssertionError
+
+    def load(*_: object) -> None:
+        raise AssertionError("loaded")
+
+    vars(write)["needs"] = ("surface",)
+    monkeypatch.setitem(registered, ("exporters", "mesh.new"), write)
+    monkeypatch.setattr("bidnerf.results.export.load_map", load)
+    monkeypatch.setattr("bidnerf_core.maps.load_map", load)
+    found = bidnerf("export", shared / "map", "--to", "mesh.new", "--out", tmp_path / "out")
+    assert_refused(found, 1, shared / "map", "no surface", "'bidnerf bake'")
+    assert not (tmp_path / "out").exists()
+    monkeypatch.setitem(sys.modules, "fastapi", None)  # as where the extra is not installed
+    for module in ("bidnerf.service.web", "bidnerf.viewer.app"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    assert_refused(bidnerf("view", shared / "map"), 1, "pip install 'bidnerf[viewer]'", "--save")
 
 
 def test_new_files_beside_inputs_are_outputs(files: Path) -> None:

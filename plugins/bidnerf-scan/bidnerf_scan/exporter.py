@@ -42,6 +42,10 @@ def export_obj(scene: Map, out: Path) -> list[Path]:
     return _export_upright(scene, out, "obj")
 
 
+for _exporter in (export_ply, export_glb, export_obj):
+    vars(_exporter)["needs"] = ("surface",)  # known before the map is loaded
+
+
 def _mesh(scene: Map) -> Mesh:
     if scene.surface is None:
         raise InputError("has no surface, from which a mesh could be made; 'bidnerf bake' adds one", where=scene.name)
