@@ -30,8 +30,8 @@ from bidnerf.results import Answers
 from bidnerf_core.datasets import DatasetFrames, Query, read_trajectory
 from bidnerf_core.errors import UsageError
 from bidnerf_core.maps import Map
-from bidnerf_core.registry import registered
 from bidnerf_core.progress import check_cancelled
+from bidnerf_core.registry import registered
 from commands import Run, assert_refused
 from flights import flight
 from stored_ground import open_ground, write_flight
