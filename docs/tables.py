@@ -523,9 +523,6 @@ def pose_files(_: Records) -> str:
     """The formats of pose files, by the ending of the file's name."""
     bundled = [info for info in list_plugins("writers") if info.is_bundled]
     rows = [(f"`{info.name}`", info.summary.rstrip(".")) for info in bundled]
-        (f"`{info.name}`", f"{info.summary[:1].lower()}{info.summary[1:]}".rstrip(".").replace("kITTI", "KITTI"))
-        for info in bundled
-    ]
     return _lines(("name ends with", "content"), rows)
 
 
