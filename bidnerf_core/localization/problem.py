@@ -265,18 +265,11 @@ def middle_of_view(problem: Problem, T: SE3 | None) -> Float[Tensor, "3"]:
         return problem.depth_rays.points.to(torch.float64).cpu().median(0).values
     if T is None:
         return torch.zeros(3, dtype=torch.float64)
-    found = rendered_middle(problem.level(0), problem.bounds, problem.views, T[None])[0].cpu().double()
+    # The renderings of 128 rays give the middle of the visible scene.
+    some = draw(problem.views, 128, uniform, torch.Generator().manual_seed(0), device=problem.device).flattened()
+    seen = render(problem.level(0), some.rays(T.to(problem.device), problem.bounds), problem.bounds.background)
+    distance = torch.where(seen.opacity > 0.5, seen.distance / seen.opacity.clamp(min=0.5), torch.nan)
+    found = (some.origins + distance[..., None] * some.directions).nanmedian(-2).values.cpu().double()
     if bool(found.isfinite().all()):
         return found
     return T.to("cpu", torch.float64).inverse().apply(torch.tensor(problem.bounds.centre, dtype=torch.float64))
-
-
-def rendered_middle(field: RadianceField, bounds: SceneBounds, views: tuple[View, ...], T: SE3) -> Float[Tensor, "h 3"]:
-    """Return the median of the rendered points along each axis, in the last camera's frame; NaN if no ray hits anything."""
-    device, generator = device_of(field), torch.Generator().manual_seed(0)
-    # The renderings of 128 rays give the middle of the visible scene.
-    some = draw(views, 128, uniform, generator, device=device).flattened()
-    rays = some.rays(T.to(device), bounds)
-    seen = render(field, rays, bounds.background)
-    distance = torch.where(seen.opacity > 0.5, seen.distance / seen.opacity.clamp(min=0.5), torch.nan)
-    return (some.origins + distance[..., None] * some.directions).nanmedian(1).values

@@ -31,6 +31,7 @@ from bidnerf_core.localization.tracking.motion import Clock
 # Inside: flow, and the parts of a state that only rare sequences fill
 from bidnerf_core.localization.tracking.points import correlate
 from bidnerf_core.localization.tracking.state import TrackerState, invert_correction
+from bidnerf_core.mapping import Landmarks, Normal, States, prior
 from conditions import ground_landmarks, with_landmarks
 from flights import (
     FRAMES,
@@ -414,8 +415,23 @@ def test_a_stated_risk_applies_to_the_confidence_of_tracked_poses(
     assert all(0.4 < require(answer.confidence) < 1 for answer in answers)
 
 
-def test_landmarks_that_do_not_determine_the_pose_are_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Posterior, "mixture", lambda self: torch.full((6, 6), torch.inf, dtype=torch.float64))
+def nothing(_: Landmarks, states: States) -> Normal:
+    none = prior(states)
+    return none - none
+
+
+@pytest.mark.parametrize(
+    ("owner", "name", "replaced"),
+    [
+        (Posterior, "mixture", lambda _: torch.full((6, 6), torch.inf, dtype=torch.float64)),
+        (Landmarks, "__call__", nothing),
+    ],
+    ids=["infinite covariance", "no information"],
+)
+def test_landmarks_that_do_not_determine_the_pose_are_no_error(
+    monkeypatch: pytest.MonkeyPatch, owner: type, name: str, replaced: Callable[..., Any]
+) -> None:
+    monkeypatch.setattr(owner, name, replaced)
     (answer,) = tracked(flight()[:1], Tracker(Localizer(textured_map()), start=flight_pose(0)))
     assert not answer.converged
 

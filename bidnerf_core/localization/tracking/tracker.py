@@ -138,7 +138,8 @@ class Tracker:
             if image is None and measured is not None:  # the shape still corrects some directions
                 return measured.answer, replace(state, motion=measured.motion, lost=state.lost + 1)
         found = None
-        if state.motion is None or predicted is None or state.lost or not self._is_near(frame, predicted):
+        is_vague = predicted is None or search_radius(frame.intrinsics, predicted.covariance, predicted.reach) is None
+        if state.motion is None or is_vague or state.lost:
             found = self._relocalize(frame, image, state, predicted)
         if image is not None and found is not None and found.converged:
             return self._begin_at(stated, image, state, found)
@@ -162,10 +163,6 @@ class Tracker:
             why = Verdict(measured.answer.outcome, measured.answer.reason, measured.answer.confidence)
         why = replace(why, reason=f"lost for {amount(state.lost, 'frame')}, bridged by {how}: {why.reason}")
         return Measurement.of(predicted, predicted, why, 1.0, state).answer, state
-
-    def _is_near(self, frame: Frame, predicted: Motion) -> bool:
-        """Return whether a prediction is certain enough for a search around it."""
-        return search_radius(frame.intrinsics, predicted.covariance, predicted.reach) is not None
 
     def _at(self, frame: Frame, T: SE3, covariance: torch.Tensor | None) -> Motion:
         """Return the motion of a camera at a pose with unknown velocity; without a ``covariance``, the pose is as uncertain as a start."""
