@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import functools
 import importlib.util
@@ -154,6 +155,25 @@ def execute(page: Path, containing: str = "") -> dict[str, Any]:
             padded = "\n" * (block.line - 1) + block.text  # errors then name the line of the page
             exec(compile(padded, str(page), "exec"), namespace)
     return namespace
+
+
+@each([page for page in PAGES if "```text" in page.read_text(encoding="utf-8")])
+def test_outputs_on_a_page_are_worded_as_the_program_words_them(page: Path) -> None:
+    """Each run of words in them, between numbers and names, is in the source of the program."""
+    files = [file for package in ("bidnerf", "bidnerf_core") for file in (ROOT / package).rglob("*.py")]
+    trees = (ast.walk(ast.parse(file.read_text(encoding="utf-8"))) for file in files)
+    texts = (node.value for tree in trees for node in tree if isinstance(node, ast.Constant))
+    program = "\n".join(" ".join(text.split()) for text in texts if isinstance(text, str))
+    outputs = [block.text for block in blocks(page, "text") if not block.text.startswith("bidnerf")]
+    phrases = re.split(r"\S*[\d_=/]\S*|[:;,()\n]|\.\.\.", "\n".join(outputs))
+    runs = [phrase.split() for phrase in phrases if len(phrase.split()) > 1]
+
+    def is_known(words: list[str]) -> bool:
+        """Return whether the program has these words in one text or, where it inserts a name or a number of things, in two."""
+        halves = ((" ".join(words[:n]), " ".join(words[n:])) for n in range(len(words)))
+        return any(first in program and second in program for first, second in halves)
+
+    assert [words for words in runs if not is_known(words)] == []
 
 
 @pytest.mark.slow

@@ -62,7 +62,7 @@ def test_example_runs(
 def test_a_backend_of_ones_own_finds_the_pose() -> None:
     example = next(path for path in EXAMPLES if path.name.startswith("04"))
     done = quietly([sys.executable, str(example)])
-    assert done.splitlines()[-1].startswith("success: bid began 0.40 m away and ended 0.0")
+    assert done.splitlines()[-1].startswith("success in your own field: off by 0.40 m, then 0.0")
 
 
 def test_what_is_shortened_is_there() -> None:
