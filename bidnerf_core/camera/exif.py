@@ -51,6 +51,10 @@ CODES = {
 }
 
 
+LARGEST_EXIF = 2**20
+"""Largest size (bytes) of tags that are parsed, which takes a hundred times as long as reading them; cameras write some 50,000."""
+
+
 @dataclass(frozen=True)
 class Exif:
     """The EXIF tags that describe the camera; None for a tag that is missing or implausible."""
@@ -72,6 +76,8 @@ class Exif:
 def read_exif(path: Path) -> Exif:
     """Read the tags of an image file; damaged tags count as missing. Raises ``InputError`` if it is not an image."""
     with open_image(path) as image:
+        if len(image.info.get("exif", b"")) > LARGEST_EXIF:
+            return Exif()
         try:
             exif = image.getexif()
             tags: dict[int, Any] = {**exif, **exif.get_ifd(IFD.Exif)}

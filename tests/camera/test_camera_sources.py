@@ -12,6 +12,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from bidnerf_core.camera import (
     UPRIGHT,
@@ -156,6 +157,13 @@ def test_damaged_exif_counts_as_missing(tmp_path: Path) -> None:
     place = content.index(b"Exif\0\0") + 6
     path.write_bytes(content[:place] + b"\xff" * 20 + content[place + 20 :])
     assert read_exif(path) == Exif()
+
+
+def test_tags_that_take_longer_to_parse_than_the_photo_are_ignored(tmp_path: Path) -> None:
+    tags = Image.Exif()
+    tags[0x0112], tags[0x9286] = 6, b"a" * 2**20
+    Image.new("RGB", (4, 3)).save(tmp_path / "a.png", exif=tags)
+    assert read_exif(tmp_path / "a.png") == Exif()
 
 
 @pytest.mark.data
