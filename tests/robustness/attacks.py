@@ -22,6 +22,7 @@ import time
 import zipfile
 from collections.abc import Callable, Iterator
 from functools import partial
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import numpy as np
@@ -321,9 +322,11 @@ def served(folder: Path, site: Path) -> Iterator[tuple[int, subprocess.Popen[byt
     """Serve a map with the GeoPose Protocol in a process, and yield its port."""
     plugin = Path(__file__).parents[2] / "plugins/bidnerf-geopose"
     info = site / "geopose_attacked-1.0.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: geopose-attacked\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[bidnerf.services]\ngeopose = bidnerf_geopose.protocol:GEOPOSE\n")
+    site.mkdir()
+    if not entry_points(group="bidnerf.services", name="geopose"):  # as if it were installed
+        info.mkdir()
+        (info / "METADATA").write_text("Metadata-Version: 2.1\nName: geopose-attacked\nVersion: 1.0\n")
+        (info / "entry_points.txt").write_text("[bidnerf.services]\ngeopose = bidnerf_geopose.protocol:GEOPOSE\n")
     path = os.pathsep.join([str(site), str(plugin), os.environ.get("PYTHONPATH", "")])
     words = ["serve", str(folder), "--port", "0", "--workers", "1", "--timeout", "20"]
     with (site / "log").open("wb") as log:

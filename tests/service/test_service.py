@@ -375,7 +375,7 @@ def test_what_is_missing_is_named(service: Service, inputs: Inputs) -> None:
         ("map=map&focal=1&focal=2", "focal is given twice"),
         ("map=map&depth_unit=1", "depth_unit was given without depth"),
         ("map=map&focal=32&hfov=60", "focal and hfov are given, expected one of"),
-        ("map=map&camera=%25YAML:1.0", "camera: expected"),
+        ("map=map&camera=%25YAML:1.0", "YAML"),
         ("map=map&camera=---%0Aa: %26a [1]%0Ab: *a", "camera: is not YAML (aliases"),
         (f"map=map&focal={'9' * 5000}", "focal is", "a number up to"),
         (f"map=map&seed={'9' * 5000}", "seed is"),
