@@ -187,6 +187,7 @@ DISPLACEMENT = 0.1
 It is about three times the largest standard deviation of position, relative to that distance, at which a landmark-based pose is accepted.
 """
 SUPPORT_BOUNDS = (
+    Bound("finite", 1.0, True, Outcome.DIVERGED, "the loss or the pose is not finite"),
     Bound("mean_loss", 0.02, False, Outcome.HIGH_LOSS, "mean loss {0:.3g}, must be below {1:.3g}"),
     Bound("on_surface", 0.85, True, Outcome.OFF_SURFACE, "only {0:.0%} of the measured points lie on the surface"),
     Bound(

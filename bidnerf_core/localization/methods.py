@@ -25,7 +25,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import Support, support
 from bidnerf_core.localization.adam import follow_gradient, recent_loss
 from bidnerf_core.localization.problem import Problem, middle_of_view, pivot
-from bidnerf_core.localization.result import Localization, Outcome, Verdict
+from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.search import RayTerms, states_at
 from bidnerf_core.localization.settings import (
     AdamSettings,
@@ -186,11 +186,10 @@ def descend_from_start(
     middle = middle_of_view(problem, T if bool(T.matrix().isfinite().all()) else None)
     measures = support(lambda T: rays.costs(states_at(T)), T, middle, rays.plain_costs())
     most = config.adam.converged_loss
-    found = Support(measures | {"mean_loss": mean}, {"mean_loss": most})
+    is_finite = float(finite and math.isfinite(mean))
+    found = Support(measures | {"finite": is_finite, "mean_loss": mean}, {"mean_loss": most})
     verdict = found.verdict(f"mean loss {mean:.3g}, must be below {most:.3g}")
     verdict = replace(verdict, reason=f"{ending}; {verdict.reason}")
-    if not finite or not math.isfinite(mean):
-        verdict = Verdict(Outcome.DIVERGED, ending)
     return Localization.of(
         verdict, SE3.stack(poses), torch.tensor(losses, dtype=torch.float64), method, began, mean, None, found
     )
