@@ -28,7 +28,7 @@ from bidnerf_core.datasets import (
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import photos_in
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import is_file, read_header, read_rows
+from bidnerf_core.io import Row, is_file, read_header, read_rows
 
 
 def _read(path: Path, folder: Path, options: DatasetOptions) -> Capture:
@@ -42,14 +42,15 @@ def _read(path: Path, folder: Path, options: DatasetOptions) -> Capture:
     name = f"{sequence.name}.txt"
     file = first_file(path, "poses.txt", name, f"{sequence.parent.parent}/poses/{name}")
     poses = dict(enumerate([] if file is None else read_matrices(file)))
-    stamps, times = path / "times.txt", dict[int, float]()
+    stamps, rows = path / "times.txt", list[Row]()
     if is_file(stamps):
         rows = read_rows(stamps, "KITTI's times.txt", "a time in seconds")
-        times = {number: row.numbers(count=1)[0] for number, row in enumerate(rows)}
     by_number = {int(image.stem): image for image in images}
-    listed = max(len(poses), len(times))
-    if gone := sorted(set(range(listed)) - by_number.keys()):
-        warn_about(path, f"{len(gone)} of {amount(listed, 'image')} are missing, first: number {gone[0]}")
+    times = {number: rows[number].numbers(count=1)[0] for number in by_number if number < len(rows)}
+    listed = max(len(poses), len(rows))
+    if gone := listed - sum(number < listed for number in by_number):
+        first = next(number for number in range(listed) if number not in by_number)
+        warn_about(path, f"{gone} of {amount(listed, 'image')} are missing, first: number {first}")
     shots = [
         Shot(
             image=image,
