@@ -1,6 +1,6 @@
 """Captures of LLFF (https://github.com/Fyusion/LLFF), as NeRF's and Mip-NeRF 360's scenes are distributed: ``poses_bounds.npy``.
 
-Each row of this file has 17 numbers for one image of ``images`` in the order of names: a 3x5 matrix, row by row,
+Each row of this file has 17 numbers for one image of ``images`` in the order of Python's ``sorted`` (10.png before 9.png): a 3x5 matrix, row by row,
 and the nearest and farthest depth. The first four columns of the matrix are the camera-to-world pose whose
 axes point down, to the right and backwards; the fifth holds the height, the width and the focal length in
 pixels. The principal point is the image centre. Where ``images`` is missing, its reduced copies
@@ -32,8 +32,10 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
         raise InputError(found, where=file, expected="rows of 17 numbers")
     if not np.isfinite(rows).all():
         raise InputError("has numbers that are not finite", where=file, expected="finite ones")
-    folders = [path / name for name in ("images", "images_2", "images_4", "images_8")]
-    images = next((photos for f in folders if f.is_dir() and (photos := photos_in(f)[0])), [])
+    folders = [options.image_folder or path / name for name in ("images", "images_2", "images_4", "images_8")]
+    images = sorted(
+        next((photos for f in folders if f.is_dir() and (photos := photos_in(f)[0])), [])
+    )  # not natural order
     if len(images) != len(rows):
         found = f"has {amount(len(rows), 'pose')} for {amount(len(images), 'image')}"
         raise InputError(found, where=file, expected="one for each, in the order of names")
@@ -53,5 +55,6 @@ reader = Format(
     f"images with {POSES_FILE} (LLFF)",
     lambda path: first_file(path, POSES_FILE),
     _read,
+    ["images"],
     precedence=16,  # made from a COLMAP model, without the distortion of its lens
 )

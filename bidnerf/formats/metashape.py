@@ -4,29 +4,31 @@ A ``camera`` has the camera-to-chunk matrix ``transform`` (4x4, row by row; Open
 in ``label``, and the ``sensor`` that took it: ``resolution`` and the adjusted ``calibration`` with ``f``
 (pixels), ``cx cy`` (from the image centre) and the distortion ``k1 k2 k3 p1 p2``, whose p1 and p2 are
 OpenCV's p2 and p1. If the chunk is georeferenced or has scale bars, its ``scale`` converts positions to
-metres; its rotation and translation are not applied, so the world is the chunk. Photos are in the folder or in
-``images``.
+metres; its rotation and translation are not applied, so the world is the chunk. The transforms of its ``components`` are. A
+camera with a ``master_id`` has the pose of that camera, moved by the ``rotation`` and ``location`` of its sensor. Photos are in
+the folder or in ``images``.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from xml.etree import ElementTree
 
 from bidnerf.formats.reality_capture import file_heads
-from bidnerf_core.camera import Camera, PanoramaFace, colmap_camera
+from bidnerf_core.camera import Camera, PanoramaFace, agisoft_camera
 from bidnerf_core.datasets import (
     Capture,
     DatasetOptions,
     FileNames,
     Format,
     Shot,
-    camera_of,
     numbers_in,
     pixel_size,
     pose_of_matrix,
+    warn_about,
 )
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import natural_order
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import is_file, parse_xml, read_file
@@ -35,27 +37,34 @@ from bidnerf_core.io import is_file, parse_xml, read_file
 def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
     """Read the cameras. Raises ``InputError`` if one is invalid."""
     chunk = _chunk(file)
-    sensors = {
-        sensor.get("id"): _camera(sensor, f"{file}: sensor {sensor.get('id')}") for sensor in chunk.iter("sensor")
-    }
+    sensors = {sensor.get("id"): sensor for sensor in chunk.iter("sensor")}
+    lenses = {key: _camera(sensor, f"{file}: sensor {key}") for key, sensor in sensors.items()}
     metric = chunk.find("transform/scale")
-    scale = 1.0 if metric is None else numbers_in(f"{file}: the scale of the chunk", metric.text or "", 1)[0]
+    scale = 1.0 if metric is None else _scale(f"{file}: the scale of the chunk", metric)
     names = FileNames(path, *(path / place for place in ("images", "photos", "input")), images=options.image_folder)
     listed = list(chunk.iter("camera"))
     cameras = {camera.get("label") or "": camera for camera in listed}
     if len(cameras) < len(listed):
         raise InputError("two cameras have the same label", where=file, expected="unique labels of photos")
-    shots = list[Shot]()
+    shots, frames, masters = list[Shot](), _components(file, chunk), {camera.get("id"): camera for camera in listed}
     for label in sorted(cameras, key=natural_order):
-        transform, sensor = cameras[label].find("transform"), sensors.get(cameras[label].get("sensor_id"))
-        where, pose, image = f"{file}: camera {label}", None, names.image(label)
+        camera, where, image = cameras[label], f"{file}: camera {label}", names.image(label)
         if not is_file(image):  # its sensor may never have been calibrated
             shots.append(Shot(image=image))
             continue
+        sensor = lenses.get(camera.get("sensor_id"))
         if sensor is None:
             raise InputError("has no calibrated sensor", where=where, expected="the id of one")
-        if transform is not None:
+        # The cameras of a rig have the pose of their master; their sensors have a pose in the master's frame.
+        master = masters.get(camera.get("master_id"), camera)
+        frame, transform = frames.get(master.get("component_id"), (1.0, SE3.identity())), master.find("transform")
+        pose = None
+        if transform is not None and frame is not None:
             pose = pose_of_matrix(where, numbers_in(where, transform.text or "", 16))
+            if master is not camera:
+                pose = pose @ _pose(where, sensors[camera.get("sensor_id")], "location")
+            pose = SE3(pose.rotation, pose.translation * frame[0])
+            pose = frame[1] @ pose
             pose = SE3(pose.rotation, pose.translation * scale)
         shots.append(Shot(image=image, camera=sensor, T_world_camera=pose))
     return Capture(
@@ -76,12 +85,60 @@ def _find(path: Path) -> Path | None:
 
 
 def _chunk(file: Path) -> ElementTree.Element:
-    """Return the first chunk. Raises ``InputError`` for invalid XML, and for XML entities, whose expansion may be unbounded."""
+    """Return the chunk with the most cameras, with a remark if several have cameras. Raises ``InputError`` for invalid XML."""
     expected = "cameras exported by Metashape"
-    chunk = parse_xml(read_file(file, expected), str(file), expected).find("chunk")
-    if chunk is None:
+    chunks = parse_xml(read_file(file, expected), str(file), expected).findall("chunk")
+    if not chunks:
         raise InputError("has no chunk", where=file, expected=expected)
-    return chunk
+    count = [sum(1 for _ in chunk.iter("camera")) for chunk in chunks]
+    if len(count) - count.count(0) > 1:
+        warn_about(
+            file,
+            f"has {len(chunks)} chunks, of which the one with {max(count)} cameras is used; export the others alone",
+        )
+    return chunks[count.index(max(count))]
+
+
+def _components(file: Path, chunk: ElementTree.Element) -> dict[str | None, tuple[float, SE3] | None]:
+    """Return the scale and pose in the chunk of each component by its id, or None for one that is not connected to those used.
+
+    Components whose transform is complete are connected; each of the others has a frame of its own. The connected ones, or
+    one other, are used, whichever has more images.
+    """
+    used, known = Counter[str | None](), dict[str | None, tuple[float, SE3] | None]()
+    for camera in chunk.iter("camera"):
+        used[camera.get("component_id")] += camera.find("transform") is not None
+    for component in chunk.findall("components/component"):
+        transform, where = component.find("transform"), f"{file}: component {component.get('id')}"
+        if transform is not None and transform.find("translation") is not None:
+            scale = transform.find("scale")
+            known[component.get("id")] = (
+                1.0 if scale is None else _scale(f"{where}: its scale", scale),
+                _pose(where, transform, "translation"),
+            )
+    others = [key for key, count in used.most_common() if count and key not in known]
+    together = sum(used[key] for key in known)
+    if others and used[others[0]] > together:
+        known = {**dict.fromkeys(known, None), others.pop(0): (1.0, SE3.identity())}
+    left = [*others, *(key for key, frame in known.items() if frame is None and used[key])]
+    if left:
+        count = sum(used.values()) - sum(used[key] for key in left)
+        warn_about(file, f"its components are not connected; the largest is used, with {amount(count, 'image')}")
+    return known | dict.fromkeys(others, None)
+
+
+def _pose(where: str, element: ElementTree.Element, position: str) -> SE3:
+    """Return a pose from its ``rotation`` (row by row) and the ``position``."""
+    turn = numbers_in(f"{where}: rotation", element.findtext("rotation") or "1 0 0 0 1 0 0 0 1", 9)
+    x = numbers_in(f"{where}: {position}", element.findtext(position) or "0 0 0", 3)
+    return pose_of_matrix(where, [*turn[:3], x[0], *turn[3:6], x[1], *turn[6:], x[2]])
+
+
+def _scale(where: str, element: ElementTree.Element) -> float:
+    (scale,) = numbers_in(where, element.text or "", 1)
+    if not 0 < scale < 1e10:
+        raise InputError(f"is {scale:g}", where=where, expected="a positive number")
+    return scale
 
 
 def _camera(sensor: ElementTree.Element, where: str) -> Camera | None:
@@ -92,22 +149,10 @@ def _camera(sensor: ElementTree.Element, where: str) -> Camera | None:
         return None
     sides = " ".join(size.get(side) or "" for side in ("width", "height"))
     width, height = pixel_size(where, numbers_in(f"{where}: its resolution", sides, 2))
-    if sensor.get("type") == "spherical":
+    kind = sensor.get("type") or "frame"
+    if kind == "spherical":
         return PanoramaFace("front", (width, height))
-    if not adjusted:
-        return None
-    values = {
-        child.tag: numbers_in(where, child.text or "", 1)[0]
-        for child in adjusted[0]
-        if child.tag not in ("resolution", "covariance", "params")
-    }
-    f, cx, cy, k1, k2, k3, k4, p1, p2, b1 = (
-        values.get(key, 0.0) for key in ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "b1")
-    )
-    numbers = f + b1, f, width / 2 + cx, height / 2 + cy
-    if sensor.get("type") == "fisheye":
-        return colmap_camera(where, "OPENCV_FISHEYE", width, height, [*numbers, k1, k2, k3, k4])
-    return camera_of(where, numbers, (width, height), (k1, k2, p2, p1, k3), first_centre=0)
+    return agisoft_camera(where, kind, (width, height), adjusted[0]) if adjusted else None
 
 
 reader = Format(

@@ -3,6 +3,7 @@ from .exif import Exif as Exif
 from .exif import Orientation as Orientation
 from .exif import read_exif as read_exif
 from .files import CameraRecord as CameraRecord
+from .files import agisoft_camera as agisoft_camera
 from .files import camera_record as camera_record
 from .files import read_camera as read_camera
 from .files import read_text_cameras as read_text_cameras

@@ -1,8 +1,9 @@
 """Files of camera intrinsics.
 
-Supported formats are the JSON of NeRF, nerfstudio, Open3D and 3D Gaussian Splatting, COLMAP's
-``cameras.txt``, hloc's lists of images with cameras, and YAML from ROS, OpenCV, ORB-SLAM and Kalibr. Pixel centres
-are at +0.5 unless the format follows OpenCV, as Open3D and the YAML files do.
+Supported formats are the JSON of NeRF, nerfstudio, Open3D, RealSense and 3D Gaussian Splatting, an answer's and its
+``intrinsics``, COLMAP's ``cameras.txt``, hloc's lists of images with cameras, YAML from ROS, OpenCV, ORB-SLAM and Kalibr, ROS's
+``ost.txt``, XML from OpenCV and Agisoft, and matrices as text. Pixel centres are at +0.5 unless the format follows OpenCV, as
+matrices, Open3D, RealSense and the YAML files do.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,10 +29,33 @@ from bidnerf_core.camera.lenses import (
     colmap_camera,
 )
 from bidnerf_core.errors import InputError, errors_in
-from bidnerf_core.io import Record, parse_json, parse_record, parse_rows, parse_yaml, read_file
+from bidnerf_core.io import (
+    Record,
+    from_plain,
+    parse_json,
+    parse_record,
+    parse_rows,
+    parse_xml,
+    parse_yaml,
+    read_file,
+)
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
 
 KEYS = {
-    "K": ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsic_matrix", "K", "k", "M1", "M"),
+    "K": (
+        "camera_matrix",
+        "cameraMatrix",
+        "Camera_Matrix",
+        "camera matrix",
+        "intrinsic_matrix",
+        "K",
+        "k",
+        "M1",
+        "M",
+        "mtx",
+    ),
     "coefficients": (
         "distortion_coefficients",
         "Distortion_Coefficients",
@@ -42,6 +66,8 @@ KEYS = {
         "d",
         "D1",
         "distortion_coeffs",
+        "dist",
+        "coeffs",
     ),
     "width": ("image_width", "image_Width", "width", "Camera.width", "img_width"),
     "height": ("image_height", "image_Height", "height", "Camera.height", "img_height"),
@@ -60,11 +86,22 @@ DISTORTIONS = {
         "perspective",
         "opencv",
         "thin_prism",
+        "brown_conrady",
         "",
     ),
 }
 """The names of distortion models in calibrations, in lower case, by our kind of model."""
 EXPECTED_YAML = "YAML from ROS (camera_info), OpenCV, ORB-SLAM or Kalibr with the intrinsics of one camera"
+FORMATS = (
+    "a camera: JSON (fl_x or fx, K, mtx or camera_matrix), YAML of ROS, OpenCV or Kalibr, COLMAP's cameras.txt (from cameras.bin:"
+    " model_converter), ROS's ost.txt, XML of OpenCV or Agisoft, or a 3x3 matrix as text"
+)
+"""The files of cameras that are read, for messages."""
+OWN_KEYS = {"fx", "fy", "cx", "cy", "width", "height", "distortion"}
+"""The keys of ``Intrinsics`` as JSON, with pixel centres at +0.5."""
+
+
+NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -161,6 +198,8 @@ def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> 
     start = content.lstrip(b"\xef\xbb\xbf \t\r\n")
     if start[:1] == b"[" and start[1:].lstrip()[:1] == b"{":
         return _choose(path, _splat_cameras(path, content), photo)
+    if re.match(rb"\[\s*[\[\d.+-]", start):
+        return parse_calibration(str(path), {"K": parse_json(content, str(path), FORMATS)}, size)
     if start[:1] in (b"{", b"["):
         return _json_camera(parse_record(str(path), content), size)
     if start.startswith((b"%YAML", b"---")) or path.suffix.lower() in (".yaml", ".yml"):
@@ -168,7 +207,64 @@ def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> 
         if not isinstance(values, Mapping):
             raise InputError(where=path, expected=EXPECTED_YAML)
         return parse_calibration(str(path), values, size)
+    if start[:1] == b"<":
+        return _xml_camera(path, content, size)
+    rows = parse_rows(content, path, FORMATS, "CAMERA_ID MODEL WIDTH HEIGHT and parameters")
+    numbers = [float(word) for row in rows[:4] for word in row.words if NUMBER.fullmatch(word)]
+    # A matrix of 3x3, 3x4 or 4x4, in one row or in several.
+    width = {9: 3, 12: 4, 16: 4}.get(len(numbers))
+    if width is not None and sum(len(row.words) for row in rows) == len(numbers):
+        return _opencv_camera(str(path), np.array(numbers).reshape(-1, width)[:3, :3], (), "", size)
+    if any(row.text == "camera matrix" for row in rows):
+        sections, title = dict[str, Any](), ""
+        for row in rows:
+            if all(map(NUMBER.fullmatch, row.words)):
+                sections.setdefault(title, []).extend(row.numbers())
+            elif (title := row.text) in sections:
+                raise row.error(": a second camera; keep the lines of one")
+        return parse_calibration(
+            str(path), sections | {key: sections.get(key, [0])[0] for key in ("width", "height")}, size
+        )
     return _choose(path, _text_cameras(path, content), photo)
+
+
+def _xml_camera(path: Path, content: bytes, size: tuple[int, int]) -> Camera:
+    """Read the XML of OpenCV's ``FileStorage``, or of a lens of Agisoft."""
+    root = parse_xml(content, str(path), FORMATS)
+    if root.tag == "opencv_storage":
+        texts = {node.tag: (node.findtext("data") or node.text or "").split() for node in root}
+        return parse_calibration(str(path), {key: t if len(t) > 1 else "".join(t) for key, t in texts.items()}, size)
+    sides = [root.findtext(side) or "" for side in ("width", "height")]
+    if root.tag != "calibration" or not all(side.isdecimal() and len(side) < 9 for side in sides):
+        raise InputError("is no camera", where=path, expected=FORMATS)
+    return agisoft_camera(str(path), root.findtext("projection") or "frame", (int(sides[0]), int(sides[1])), root)
+
+
+def agisoft_camera(where: str, kind: str, size: tuple[int, int], lens: Element) -> Camera:
+    """Return the camera of a lens of Agisoft's XML, whose projection is ``kind``.
+
+    ``f`` is in pixels, ``cx cy`` are relative to the image centre, and p1 and p2 are OpenCV's p2 and p1. Raises ``InputError`` for
+    a projection or a coefficient that OpenCV's models lack.
+    """
+    if kind == "spherical":
+        return PanoramaFace("front", size)
+    values = dict[str, float]()
+    for key in ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2"):
+        text = (lens.findtext(key) or "0").strip()
+        if not NUMBER.fullmatch(text):
+            raise InputError(f"{key} is {text[:60]!r}", where=where, expected="a number")
+        values[key] = float(text)
+    f, cx, cy, k1, k2, k3, k4, p1, p2, *_, b1, _ = values.values()
+    is_fisheye = kind in ("fisheye", "equidistant_fisheye")
+    unread = next((key for key in ("b2", "p3", "p4", *(("p1", "p2") if is_fisheye else ("k4",))) if values[key]), None)
+    if unread or not (is_fisheye or kind == "frame"):
+        found = f"{unread} of the lens is {values[unread]:g}" if unread else f"the projection of the lens is {kind}"
+        raise InputError(found, where=where, expected="a lens that OpenCV describes; export undistorted images")
+    numbers = f + b1, f, size[0] / 2 + cx, size[1] / 2 + cy
+    with errors_in(where):
+        if is_fisheye:
+            return CentralLens(FISHEYE, Intrinsics(*numbers, *size), (k1, k2, k3, k4))
+        return Intrinsics(*numbers, *size, (k1, k2, p2, p1, k3) if any((k1, k2, p1, p2, k3)) else ())
 
 
 def _json_camera(record: Record, size: tuple[int, int]) -> Camera:
@@ -179,7 +275,22 @@ def _json_camera(record: Record, size: tuple[int, int]) -> Camera:
         if len(cameras) > 1:
             raise record.error(f"holds {len(cameras)} cameras", expected="one")
         return cameras.pop()
-    if any(key in values for key in ("intrinsic_matrix", "intrinsic", "camera_matrix", "K")):
+    for key in ("intrinsics", "camera", "color", "colour", "rgb"):  # of an answer, Replica, RealSense
+        if isinstance(inner := values.get(key), Mapping) and "fl_x" not in values:
+            return _json_camera(Record(f"{record.where}: {key}", inner), size)
+    if values.keys() == OWN_KEYS:
+        with errors_in(record.where):
+            return from_plain(Intrinsics, values, record.where)
+    if "fx" in values:
+        names = (("fx",), ("fy",), ("cx", "ppx"), ("cy", "ppy"))
+        fx, fy, cx, cy = (next((record.number(key) for key in each if key in values), None) for each in names)
+        if fx is None or cx is None or cy is None:
+            raise record.error(
+                "has fx but no cx and cy", expected="fx, fy, cx, cy (pixels), and perhaps width and height"
+            )
+        values = {**values, "K": [fx, 0, cx, 0, fx if fy is None else fy, cy, 0, 0, 1], "w": None}
+        values |= {"distortion_model": str(values.get("model", "")).rpartition(".")[2]}
+    if any(values.get(key) for key in ("intrinsic_matrix", "intrinsic", *KEYS["K"])):
         return parse_calibration(record.where, values, size)
     camera = camera_record(record)
     return camera.intrinsics(camera.width or size[0], camera.height or size[1])
@@ -224,7 +335,7 @@ def read_text_cameras(path: Path) -> dict[int, Camera]:
 
 def _text_cameras(path: Path, content: bytes, named: bool = True) -> dict[str, Camera]:
     """Parse rows of ``CAMERA_ID MODEL WIDTH HEIGHT PARAMS...``, or hloc's rows with an image name instead of the id."""
-    expected = "transforms.json or cameras.txt (COLMAP's model_converter makes it from cameras.bin)"
+    expected = f"a camera: {FORMATS}"
     cameras: dict[str, Camera] = {}
     for row in parse_rows(content, path, expected, "CAMERA_ID MODEL WIDTH HEIGHT and parameters"):
         words = row.words
@@ -281,6 +392,8 @@ def parse_calibration(where: str, values: Mapping[str, Any], size: tuple[int, in
 def _opencv_camera(where: str, K: Any, lens: tuple[float, ...], model: str, size: tuple[int, int]) -> Camera:
     """Return the camera of a matrix and coefficients, as ``Intrinsics.from_opencv`` does, or a fisheye lens."""
     kind = next((kind for kind, names in DISTORTIONS.items() if model.lower() in names), None)
+    if kind is None and "brown_conrady" in model.lower() and not any(lens):  # RealSense's own, without distortion
+        kind = PERSPECTIVE
     if kind is None:
         raise InputError(
             f"distortion model {model}", where=where, expected="plumb_bob, rational_polynomial or equidistant"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from hypothesis import strategies as st
 from bidnerf_core.camera import CentralLens, Intrinsics, read_camera
 from bidnerf_core.datasets import DatasetOptions, Photos, depth_files
 from bidnerf_core.frames import Frame
+from bidnerf_core.io import to_plain
 from photo_files import noise, write_photo
 from refusals import refused
 
@@ -83,8 +85,8 @@ def kalibr(camera: Intrinsics) -> str:
     return KALIBR.format(four=list(camera.distortion[:4]), focal_and_centre=numbers)
 
 
-def opencv(camera: Intrinsics, *names: str, **sizes: int) -> str:
-    storage = cv2.FileStorage(".yaml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
+def opencv(camera: Intrinsics, *names: str, kind: str = ".yaml", **sizes: int) -> str:
+    storage = cv2.FileStorage(kind, cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
     arrays = (np.array(matrix(camera)).reshape(3, 3), np.array(camera.distortion))
     for name, value in (*sizes.items(), *zip(names, arrays, strict=True)):
         storage.write(name, value)
@@ -94,6 +96,46 @@ def opencv(camera: Intrinsics, *names: str, **sizes: int) -> str:
 def open3d(camera: Intrinsics) -> dict[str, object]:
     columns = np.array(matrix(camera)).reshape(3, 3).T.ravel().tolist()
     return {"width": camera.width, "height": camera.height, "intrinsic_matrix": columns}
+
+
+def ost(camera: Intrinsics) -> str:
+    """As ROS's camera_calibration writes it."""
+    rows = "\n".join(" ".join(map(repr, matrix(camera)[i : i + 3])) for i in (0, 3, 6))
+    lens = " ".join(map(repr, camera.distortion))
+    identity = "1 0 0\n0 1 0\n0 0 1"
+    return (
+        f"# oST version 5.0 parameters\n\n\n[image]\n\nwidth\n640\n\nheight\n480\n\n[narrow_stereo]\n\ncamera matrix\n{rows}\n\n"
+        f"distortion\n{lens}\n\nrectification\n{identity}\n\nprojection\n1 0 3 0\n0 1 3 0\n0 0 1 0\n"
+    )
+
+
+def agisoft(camera: Intrinsics) -> str:
+    k1, k2, p1, p2, k3 = camera.distortion
+    values = {"f": camera.fy, "cx": camera.cx - 320, "cy": camera.cy - 240, "b1": camera.fx - camera.fy}
+    values |= {"k1": k1, "k2": k2, "k3": k3, "p1": p2, "p2": p1}
+    lens = "".join(f"<{key}>{value!r}</{key}>" for key, value in values.items())
+    size = "<projection>frame</projection><width>640</width><height>480</height>"
+    return f'<?xml version="1.0"?><calibration>{size}{lens}</calibration>'
+
+
+def by_names(camera: Intrinsics, **names: str) -> str:
+    """The JSON of RealSense and of most scripts, in which ``names`` replace others."""
+    values = {
+        "width": 640,
+        "height": 480,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx - 0.5,
+        "cy": camera.cy - 0.5,
+    }
+    return json.dumps({names.get(key, key): value for key, value in values.items()} | {"coeffs": camera.distortion})
+
+
+def as_text(camera: Intrinsics, width: int = 3, rows: int = 3) -> str:
+    """The matrix as NumPy writes it."""
+    K = np.eye(max(rows, 3), width)
+    K[:3, :3] = np.array(matrix(camera)).reshape(3, 3)
+    return "\n".join(" ".join(map(repr, row)) for row in K.tolist()) + "\n"
 
 
 def splats(*cameras: Intrinsics) -> str:
@@ -113,6 +155,18 @@ FILES: dict[str, tuple[Callable[[Intrinsics], str], int]] = {
     "view.json": (lambda camera: json.dumps({"extrinsic": [1.0] * 16, "intrinsic": open3d(camera)}), 0),
     "path.json": (lambda camera: json.dumps({"parameters": [{"intrinsic": open3d(camera)}] * 3}), 0),
     "splats.json": (splats, 0),
+    "opencv.xml": (lambda camera: opencv(camera, *NAMES, kind=".xml", image_width=640, image_height=480), 5),
+    "ost.txt": (ost, 5),
+    "agisoft.xml": (agisoft, 5),
+    "realsense.json": (partial(by_names, cx="ppx", cy="ppy"), 5),
+    "script.json": (by_names, 5),
+    "mtx.json": (lambda c: json.dumps({"mtx": np.reshape(matrix(c), (3, 3)).tolist(), "dist": [c.distortion]}), 5),
+    "own.json": (lambda camera: json.dumps(to_plain(camera)), 5),
+    "answer.json": (lambda camera: json.dumps({"name": "a.jpg", "intrinsics": to_plain(camera)}), 5),
+    "K.txt": (as_text, 0),
+    "K4.txt": (partial(as_text, width=4, rows=4), 0),
+    "row.txt": (lambda camera: as_text(camera, width=4).replace("\n", " "), 0),
+    "K.json": (lambda camera: json.dumps(np.reshape(matrix(camera), (3, 3)).tolist()), 0),
     "list.txt": (lambda camera: HLOC.format(camera=camera), 0),
 }
 """What writes a camera as other programs do, and how many of its coefficients the format keeps."""
@@ -211,6 +265,26 @@ def test_fisheye_calibrations(content: str, tmp_path: Path) -> None:
     assert isinstance(found, CentralLens)
     assert (found.stored.fx, found.stored.cx, found.stored.cy) == (500.0, 311.0, 240.75)
     assert found.coefficients[:2] == (0.1, -0.2)
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    {
+        "a picture": ("<svg><g/></svg>", "is no camera"),
+        "b2": (agisoft(CAMERA).replace("</calibration>", "<b2>0.1</b2></calibration>"), "b2 of the lens is 0.1"),
+        "k4": (agisoft(CAMERA).replace("</calibration>", "<k4>1e-3</k4></calibration>"), "k4 of the lens is 0.001"),
+        "another lens": (agisoft(CAMERA).replace(">frame<", ">equisolid_fisheye<"), "lens is equisolid_fisheye"),
+        "words": (agisoft(CAMERA).replace("<cx>", "<cx>nan"), "cx is 'nan-9.0'"),
+        "two cameras": (ost(CAMERA) + ost(CAMERA), "a second camera"),
+        "no centre": ('{"fx": 500, "fy": 500}', "no cx and cy"),
+        "prose": ("my camera has 500 pixels\n", "camera model camera"),
+        "half a matrix": ("500 0 320\n0 500 240\n", "line 1 has 3 entries"),
+    }.values(),
+)
+def test_files_of_other_programs_that_hold_no_camera(content: str, found: str, tmp_path: Path) -> None:
+    (tmp_path / "c").write_text(content)
+    with refused(found=found):
+        read_camera(tmp_path / "c", SIZE)
 
 
 def test_the_camera_of_a_photo_is_chosen_by_its_name(tmp_path: Path) -> None:

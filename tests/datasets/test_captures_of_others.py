@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,9 +12,13 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from bidnerf import Frame, open_dataset, open_sequence
+from bidnerf_core.camera import CentralLens
+from bidnerf_core.datasets import Shot
+from bidnerf_core.geometry import SE3
 from refusals import refused
 from scan_layouts import (
     SMALL,
@@ -169,6 +174,57 @@ def test_what_is_kept_otherwise_is_read(kind: str, tmp_path: Path) -> None:
     assert sizes == {(8, 6) if "reduced" in kind else (SMALL.width, SMALL.height)}
     times = [shot.time for shot in open_sequence(folder).shots if shot.time is not None]
     assert not times or max(times) - min(times) < 2 * COUNT
+
+
+def in_metashape(change: Callable[[str], str], folder: Path) -> list[Shot]:
+    """Write two photos, change the XML, and return the shots that have a pose."""
+    file = write_metashape(folder, small_views(2)) / "cameras.xml"
+    file.write_text(change(file.read_text()))
+    return [shot for shot in open_dataset(folder).shots if shot.T_world_camera is not None]
+
+
+COMPONENT = (
+    "<components><component id='1'><transform><rotation>0 -1 0 1 0 0 0 0 1</rotation><translation>1 2 3</translation>"
+    "<scale>2</scale></transform></component></components><cameras>"
+)
+TURNED = SE3(torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).double(), torch.tensor([1.0, 2, 3]).double())
+
+
+def test_metashape_joins_components_and_rigs_and_leaves_out_what_is_not_connected(tmp_path: Path) -> None:
+    first, second = (view.T_ref_camera for view in small_views(2))
+    both = in_metashape(
+        lambda x: re.sub("<camera ", '<camera component_id="1" ', x).replace("<cameras>", COMPONENT), tmp_path / "a"
+    )
+    expected = TURNED @ SE3(second.rotation, 2 * second.translation)
+    torch.testing.assert_close(both[1].T_world_camera.matrix(), expected.matrix(), atol=1e-9, rtol=0)
+    apart = in_metashape(lambda x: x.replace('<camera id="1"', '<camera id="1" component_id="2"'), tmp_path / "b")
+    assert len(apart) == 1
+    sensor = '<sensor id="1" type="frame"><resolution width="16" height="12"/><rotation>0 -1 0 1 0 0 0 0 1</rotation><location>1 2 3</location><calibration><f>20</f></calibration></sensor></sensors>'
+    slave = re.compile(r'<camera id="1" sensor_id="0"([^>]*)><transform>.*?</transform>')
+    rig = in_metashape(
+        lambda x: slave.sub(r'<camera id="1" sensor_id="1" master_id="0"\1>', x).replace("</sensors>", sensor),
+        tmp_path / "c",
+    )
+    torch.testing.assert_close(rig[1].T_world_camera.matrix(), (first @ TURNED).matrix(), atol=1e-9, rtol=0)
+    empty = in_metashape(lambda x: x.replace("<chunk>", "<chunk/><chunk>"), tmp_path / "d")
+    assert len(empty) == 2
+    fisheye = in_metashape(lambda x: x.replace('type="frame"', 'type="equidistant_fisheye"'), tmp_path / "e")
+    assert isinstance(fisheye[0].camera, CentralLens)
+    for scale in ("0", "-1", "1e308"):
+        with refused(found=f"is {float(scale):g}", expected="a positive number"):
+            in_metashape(
+                lambda x, s=scale: x.replace("<cameras>", f"<transform><scale>{s}</scale></transform><cameras>"),
+                tmp_path / "f",
+            )
+
+
+def test_rows_of_llff_are_in_the_order_of_sorted(tmp_path: Path) -> None:
+    folder = write_llff(tmp_path, small_views(3))
+    for number, name in enumerate(("IMG_10", "IMG_8", "IMG_9")):
+        (folder / "images" / f"{number:03d}.png").rename(folder / "images" / f"{name}.png")
+    shots = {shot.stem: shot.T_world_camera for shot in open_dataset(folder).shots}
+    for name, view in zip(("IMG_10", "IMG_8", "IMG_9"), small_views(3), strict=True):
+        torch.testing.assert_close(shots[name].translation, view.T_ref_camera.translation, atol=1e-6, rtol=0)
 
 
 def test_a_folder_of_images_is_named_where_several_fit(tmp_path: Path) -> None:
