@@ -37,7 +37,7 @@ class FieldConfig(Settings):
     encoding: HashEncodingConfig = field(
         default_factory=lambda: HashEncodingConfig(levels=10, log2_table_size=18, finest_resolution=1024)
     )
-    # cells of the finest level per pixel footprint; limited by finest_resolution, which is used alone if this
+    # cells of the finest level per pixel footprint; limited by `finest_resolution`, which is used alone if this
     # is 0
     cells_per_pixel: NotNegative = 2.5
     width: Count = 64  # units of a hidden layer

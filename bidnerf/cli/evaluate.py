@@ -12,7 +12,7 @@ from urllib.parse import quote
 from bidnerf.cli.options import (
     TEST_IMAGES,
     Device,
-    Frames,
+    FrameNames,
     Json,
     MethodGroup,
     MethodOptions,
@@ -62,7 +62,7 @@ class TrialOptions:
     seed: Annotated[
         int | None, WholeNumbers(0, LARGEST_SEED), Option("N", "seed of every random choice", "the protocol's")
     ] = None
-    frame: Frames = ()
+    frame: FrameNames = ()
 
     def plan(self, method: MethodOptions, images: DatasetOptions, **more: Any) -> Plan:
         """Return the plan of the trials; ``more`` holds the fields of the plan that these options do not set."""
@@ -138,7 +138,7 @@ def run_evaluate(
     method: MethodGroup,
     json: Json = False,
 ) -> None:
-    """Localize many frames of a dataset, and write one JSON line a trial.
+    """Localize many frames of a dataset, and write a JSON line a trial.
 
     Trials begin at perturbed starts, or at none. Finished trials are always kept: the same command resumes where it stopped.
     'bidnerf report' makes tables and figures from the results.
@@ -261,11 +261,7 @@ def run_report(
         raise InputError("no such folder", where=missing[0], expected="a dataset that the results are of")
     check_folder(out, (*results, *data))
     runs = [(path.name, read_runs(path)) for path in results]
+    link = None if view is None else quote(Path(os.path.relpath(view.resolve(), out.resolve())).as_posix())
     with console.status("drawing"):
-        page = write_report(table, out, title, chosen, runs, None if view is None else link_to(view, out), data)
+        page = write_report(table, out, title, chosen, runs, link, data)
     print_result(None, [*str(table).split("\n"), f"look at {page}"], json=False)
-
-
-def link_to(page: Path, folder: Path) -> str:
-    """Return the relative URL by which pages in ``folder`` can link to ``page``."""
-    return quote(Path(os.path.relpath(page.resolve(), folder.resolve())).as_posix())

@@ -13,7 +13,7 @@ from bidnerf.cli.options import (
     BakeSettings,
     ColourImages,
     Device,
-    Frames,
+    FrameNames,
     Json,
     MapFolder,
     MappedImages,
@@ -160,7 +160,7 @@ def run_render(
     map: MapFolder,
     data: Annotated[Path, Option("DATA", "folder of a dataset, or a .r3d file", positional=True)],
     out: Annotated[Path, Option("DIR", "folder for the images")],
-    frame: Frames = (),
+    frame: FrameNames = (),
     level: Annotated[
         int | None, EXPERT, Option("N", "level of detail, 0 the coarsest", "the field itself, the finest")
     ] = None,

@@ -38,7 +38,7 @@ Seed: TypeAlias = Annotated[int, WholeNumbers(0, LARGEST_SEED), Option("N", "see
 Json: TypeAlias = Annotated[bool, FLAG, Option(None, "print JSON: one value on a line")]
 NoDepth: TypeAlias = Annotated[bool, FLAG, Option(None, "leave out measured depth")]
 Names: TypeAlias = tuple[str, ...]
-Frames: TypeAlias = Annotated[Names, Option("NAME...", "use only these frames of a dataset", "all of the split")]
+FrameNames: TypeAlias = Annotated[Names, Option("NAME...", "use only these frames of a dataset", "all of the split")]
 
 
 BakeSettings: TypeAlias = Annotated[
@@ -117,7 +117,7 @@ class MapOutput:
     device: Device = "cpu"
 
 
-NewMap: TypeAlias = Annotated[MapOutput, Group("map", "How the map is written, and its landmarks are made.")]
+NewMap: TypeAlias = Annotated[MapOutput, Group("map", "How the map is made and written.")]
 
 
 def require_one(values: Mapping[str, object], required: bool = False) -> None:
@@ -198,7 +198,7 @@ class QueryOptions:
         tuple[Path, ...],
         Option("FILE...", "depth images or .npy files of the photos, in the same order, or matched by name"),
     ] = ()
-    frame: Frames = ()
+    frame: FrameNames = ()
     rig: Annotated[bool, FLAG, Option(None, "find one pose for the frames in --frame, together as a rig")] = False
     window: Annotated[
         int,

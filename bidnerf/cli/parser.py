@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
 from bidnerf.cli.program import option_name
-from bidnerf_core.errors import InputError, UsageError, enumeration, spelling_hint
+from bidnerf_core.errors import InputError, UsageError, enumeration, spelled, spelling_hint
 from bidnerf_core.settings import Allowed, Expert, OneOf
 
 T = TypeVar("T")
@@ -128,9 +128,13 @@ class Parameter:
         """The help text, with the default."""
         option, default, words = self.option, self.default, self.option.default
         if words is None and default is not MISSING and default not in (None, (), "") and default is not False:
-            words = " ".join(map(str, default if isinstance(default, tuple) else (default,)))
+            values = default if isinstance(default, tuple) else (default,)
+            words = " ".join(
+                f"{x:.4g}" if type(x) is float else f"{x:,}" if type(x) is int and x >= 10_000 else str(x)
+                for x in values
+            )
         text = option.help if isinstance(option.help, str) else option.help()
-        text = " ".join((text or self.doc).replace("``", "'").split())
+        text = spelled(" ".join((text or self.doc).replace("``", "'").split()), option_name)
         if default is MISSING and not option.positional:
             text += " (required)"
         return (f"{text} (default: {words.replace('True', 'yes')})" if words else text).replace("%", "%%")
@@ -429,6 +433,7 @@ def conversion(hint: Any, notes: Sequence[Any] = ()) -> tuple[int | str | None, 
     choices = {str(c): c for kind in kinds if typing.get_origin(kind) is Literal for c in typing.get_args(kind)}
     plain = [kind for kind in kinds if kind in KINDS]
     metavar = KINDS[plain[0]][0] if plain else f"{{{','.join(choices)}}}"
+    metavar = "NAME" if metavar == "TEXT" and any(isinstance(limit, OneOf) for limit in limits) else metavar
     names = [f"one of {', '.join(choices)}"] if choices else []
     expected = " or ".join([*names, *(KINDS[kind][1] for kind in plain)])
 

@@ -53,7 +53,7 @@ class TrackingOptions:
         float | None,
         EXPERT,
         Option(
-            "SHARE",
+            None,
             "tolerated fraction of wrong poses among those accepted",
             "accepted as usual",
         ),

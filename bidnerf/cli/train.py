@@ -242,21 +242,21 @@ def _interrupted(
 
     info = check_resumable(out, not target.no_bake)
 
-    def require_same(name: str, value: object, usual: object, before: object) -> None:
-        if value not in (usual, before):
-            raise UsageError(
-                f"{out}: was started with {name} {before}, got {value}; --resume keeps it, --overwrite starts again"
-            )
-
-    require_same("backend", backend, None, info.backend)
     kind: Any = load_backend(info.backend, str(out)).config_type
     stored, unchanged = to_flat(from_plain(kind, info.config, f"{out}: config")), to_flat(kind())
-    for key, value in to_flat(config).items():
-        require_same(key, value, unchanged[key], stored[key])
+    rows = [(key, value, unchanged[key], stored[key]) for key, value in to_flat(config).items()]
     refinement = info.pose_refinement
     if refinement is not None:  # None: "never", or too few keypoints for refinement
         before = "always" if refinement.refined or refinement.replaced else "never"
-        require_same("refine_poses", given_poses.refine_poses, "auto", before)
-    require_same("largest", images.largest, None, longest_side(info))
-    require_same("landmark_features", target.landmark_features, USUAL_FEATURES, info.landmark_features)
+        rows.append(("refine_poses", given_poses.refine_poses, "auto", before))
+    rows += [
+        ("backend", backend, None, info.backend),
+        ("largest", images.largest, None, longest_side(info)),
+        ("landmark_features", target.landmark_features, USUAL_FEATURES, info.landmark_features),
+    ]
+    for name, value, usual, stated in rows:
+        if value not in (usual, stated):
+            raise UsageError(
+                f"{out}: was started with `{name}` {stated}, got {value}; `resume` keeps it, `overwrite` starts again"
+            )
     return info

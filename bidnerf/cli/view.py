@@ -172,9 +172,7 @@ def run_serve(
     method: MethodName = USUAL_METHOD,
     device: Device = "cpu",
     *,
-    limits: Annotated[
-        ServiceLimits, Group("limits", "How many requests are served at a time, and how large they may be.")
-    ],
+    limits: Annotated[ServiceLimits, Group("limits", "What the service takes on.")],
 ) -> None:
     """Serve localization over HTTP: photos in, poses out.
 

@@ -31,7 +31,7 @@ from bidnerf_core.frames import photos_in
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import parse_yaml, read_file, read_header, read_rows
 
-COLUMNS = "timestamp x y z qx qy qz qw id"
+TRAJECTORY_COLUMNS = "timestamp x y z qx qy qz qw id"
 
 
 def _read(path: Path, match: tuple[Path, Path], options: DatasetOptions) -> Capture:
@@ -39,7 +39,7 @@ def _read(path: Path, match: tuple[Path, Path], options: DatasetOptions) -> Capt
     folder, file = match
     of_robot, prefix = "camera" not in file.name, folder.name.removesuffix("rgb")
     poses, times = dict[str, SE3 | None](), dict[str, float]()
-    for row in read_rows(file, "poses of RTAB-Map", COLUMNS):
+    for row in read_rows(file, "poses of RTAB-Map", TRAJECTORY_COLUMNS):
         if len(row.words) not in (8, 9):
             raise row.error(f" has {len(row.words)} entries; export the poses in format 11")
         numbers = row.plain_numbers(row.words)

@@ -39,7 +39,7 @@ from bidnerf_core.training import sharpness
 
 FRAME_STEP = 0.04
 """Image motion between chosen frames, as a fraction of the image diagonal."""
-FEW = 60
+FEW_PHOTOS = 60
 """Largest number of images of a recording that are all used; of more, frames are chosen as of a video."""
 MOST = 400
 """Largest number of chosen frames; in long videos, the steps are longer."""
@@ -115,7 +115,7 @@ def photos_of(
             )
         warn_about(folder, f"its {recording.pose_file or 'recording'} has no poses, so they are found from its images")
         chosen: Sequence[int] = range(len(recording))
-        if len(chosen) > FEW:
+        if len(chosen) > FEW_PHOTOS:
             chosen = choose_frames(measure_frames(CaptureFrames(recording)))
         return [
             SourceImage(

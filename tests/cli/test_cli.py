@@ -268,8 +268,8 @@ def test_what_cannot_be_resumed_is_told_in_a_line(
         ([data, "--out", shared / "map", "--no-bake"], 1, ("complete", "12 steps")),
         ([other, "--out", interrupted], 1, (other,)),
         ([data, "--out", interrupted, "--split", "test"], 1, ("'test'", "'data'")),
-        ([data, "--out", interrupted, "--steps", "99"], 2, ("steps 12", "99")),
-        ([data, "--out", interrupted, "--base-resolution", "8"], 2, ("base_resolution 4.0", "8.0")),
+        ([data, "--out", interrupted, "--steps", "99"], 2, ("--steps 12", "99")),
+        ([data, "--out", interrupted, "--base-resolution", "8"], 2, ("--base-resolution 4.0", "8.0")),
         ([data, "--out", interrupted, "--overwrite"], 2, ("--overwrite",)),
         ([data, "--out", interrupted, "--background", "black"], 2, ("background", "(0.0, 0.0, 0.0)")),
     ]

@@ -98,7 +98,7 @@ def test_a_resumed_training_takes_the_refined_poses_again(
         assert bidnerf(*train, "--out", tmp_path / "half").status == 130
     monkeypatch.setattr("bidnerf_core.captures.training_views.training_poses", None)  # it is not called again
     resume = ["train", shared / "data", "--resume", "--out", tmp_path / "half"]
-    assert_refused(bidnerf(*resume, "--refine-poses", "never"), 2, "refine_poses always")
+    assert_refused(bidnerf(*resume, "--refine-poses", "never"), 2, "--refine-poses always")
     assert bidnerf(*resume, "--no-bake").status == 0
     assert_same_map(tmp_path / "half", tmp_path / "whole")
     assert load_info(tmp_path / "half").cameras == load_info(tmp_path / "whole").cameras

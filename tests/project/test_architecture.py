@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -60,6 +61,20 @@ def _defined(node: ast.stmt) -> Iterator[str]:
         yield node.name
     targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
     yield from (n.id for target in targets for n in ast.walk(target) if isinstance(n, ast.Name))
+
+
+def test_messages_name_settings_and_not_options(trees: dict[str, ast.Module]) -> None:
+    """The command line and the service spell the names in backticks their way; whole commands may be quoted anywhere."""
+    found = list[tuple[str, str]]()
+    for name, tree in trees.items():
+        # The guide prints the advice about outcomes; a contract tests the command line itself.
+        if not name.startswith(("bidnerf/cli", "bidnerf/testing", "bidnerf_core/localization")):
+            nodes = [*ast.walk(tree)]
+            docs = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+            texts = [node.value for node in nodes if isinstance(node, ast.Constant) and id(node) not in docs]
+            messages = [re.sub(r"'bidnerf [^']*'", "", text) for text in texts if isinstance(text, str) and " " in text]
+            found += [(name, text) for text in messages if re.search(r"(?<![\w-])--[a-z]", text)]
+    assert found == []
 
 
 BY_NAME = {

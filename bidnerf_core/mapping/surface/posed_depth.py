@@ -216,7 +216,7 @@ def choose_grid(
         size = "too many cells" if math.isinf(needed) else f"{needed / 1e6:.0f} MB"
         warnings.warn(
             f"the surface would take {size} with cells of {wished.cell:.3g}; cells of {grid.cell:.3g} keep it within"
-            f" {megabytes:g} MB; raise this limit with 'bake --megabytes'",
+            f" {megabytes:g} MB; raise this limit (`megabytes`)",
             InputWarning,
             stacklevel=2,
         )
