@@ -12,7 +12,7 @@ import torch
 import bidnerf as bn
 import tiny
 from bidnerf.results import read_positions
-from bidnerf.testing import BOUNDS, textured_map, unseen
+from bidnerf.testing import BOUNDS, GROUND_CAMERA, textured_map, unseen
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.fields import levels
 from bidnerf_core.io import FileInUse, lock
@@ -68,7 +68,7 @@ def test_scaling_back_gives_the_same_answers(ground: Map) -> None:
 def test_a_known_length_gives_the_factor(ground: Map) -> None:
     assert factor_of_distance(ground, "c0", "c1", 2.8284271247) == pytest.approx(2)
     assert factor_of_distance(ground, "0,0,0", (0.0, 3.0, 4.0), 1.0) == pytest.approx(0.2)
-    low, high = (f"c0@{0.25 * CAMERA.width},{y * CAMERA.height}" for y in (0.4, 0.6))
+    low, high = (f"c0@{0.25 * GROUND_CAMERA.width},{y * GROUND_CAMERA.height}" for y in (0.4, 0.6))
     apart = factor_of_distance(ground, low, high, 1.0)
     assert factor_of_distance(ground.scaled(0.5), low, high, 1.0) == pytest.approx(2 * apart, rel=1e-3)
     assert factor_of_distance(ground, "0", "1.png", 2.8284271247) == pytest.approx(2)  # endings of one name each
@@ -86,7 +86,7 @@ def test_a_known_length_gives_the_factor(ground: Map) -> None:
             factor_of_distance(ground, bad, "c1", 1.0)
         assert instead in caught.error.found
     assert factor_of_distance(ground, "c0.png", "c1.JPG", 2.8284271247) == pytest.approx(2)
-    file, name = f"c0.png@{0.25 * CAMERA.width},1", f"c0@{0.25 * CAMERA.width},1"
+    file, name = f"c0.png@{0.25 * GROUND_CAMERA.width},1", f"c0@{0.25 * GROUND_CAMERA.width},1"
     assert torch.equal(locate_point(ground, file), locate_point(ground, name))
 
 
