@@ -111,7 +111,7 @@ def run_demo(
                     ]
                 )
         show("Pose errors before and after")
-        print_table(["frame", "method", "start off by", "", "found off by", "", "steps", "seconds", "accepted"], rows)
+        print_table(["frame", "method", "off before", "", "off after", "", "steps", "seconds", "accepted"], rows)
         _draw(stored, trials, out)
 
 
@@ -140,4 +140,6 @@ def _draw(stored: Map, trials: list[DemoFrame], out: Path) -> None:
     with console.status("drawing the animation"):
         save_gif(out / "localization.gif", [painter.blend(path[i]) for i in moments])
     show(f"look at {out / 'overlay-*.png'}, {out / 'localization.gif'}")
+    photo = out / "data" / "images" / "test" / f"{first.view.frame.name}.png"
+    show(f"ask for a photo: bidnerf localize {out / 'map'} {photo} --focal {first.view.frame.intrinsics.fx:g}")
     show(f"see why a pose was found: bidnerf view {out / 'map'} {out / 'data'}  (pip install 'bidnerf[viewer]')")

@@ -668,7 +668,10 @@ def test_the_demo_leaves_a_map_and_the_data_that_it_was_made_from(
         monkeypatch.setattr(f"bidnerf.cli.demo.{name}", less)
     monkeypatch.setattr("bidnerf_core.maps.training.USUAL_BAKE", BakeConfig(cells=20_000))
     out = tmp_path / "out"
-    assert bidnerf("demo", "--steps", 5, "--frames", 1, "--out", out).status == 0
+    made = bidnerf("demo", "--steps", 5, "--frames", 1, "--out", out)
+    assert made.status == 0
+    (hint,) = [line for line in made.out.splitlines() if line.startswith("ask for a photo: bidnerf ")]
+    assert bidnerf(*hint.split()[5:]).out.startswith("0000: ")
     data = open_dataset(out / "data")
     assert len(data.views("train")) == len(load_map(out / "map").info.cameras)
     [view] = data.views("test")

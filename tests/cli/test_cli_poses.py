@@ -62,7 +62,10 @@ def test_a_map_holds_refined_and_given_poses(bidnerf: Run, refined: Path, views:
     for view, (_, T) in zip(views, cameras_of(info), strict=True):
         torch.testing.assert_close((view.T_ref_camera.inverse() @ T).log(), UPDATE, rtol=0, atol=1e-9)
     shown = bidnerf("info", refined).out
-    assert f"0.60 px to the 0.36 px of keypoints; the poses are refined by {UPDATE[:3].norm():.3g} and" in shown
+    assert (
+        f"0.60 px to the 0.36 px by which keypoints scatter; the poses are refined by {UPDATE[:3].norm():.3g} and"
+        in shown
+    )
     assert f"by the landmarks of the other images: {views[1].frame.name} by" in shown
     facts = json.loads(bidnerf("info", refined, "--json").out)
     assert [moved["name"] for moved in facts["moved"]] == [view.frame.name for view in views]

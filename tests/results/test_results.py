@@ -71,6 +71,10 @@ def test_a_sequence_is_tracked_in_a_thread_of_any_kind(folder: Path, caplog: pyt
     assert errors.raw.translation_p95 < 0.02
     assert [line for line in caplog.messages if "tracking again after 1 frame" in line]
     path.write(folder.parent / "path.json")
+    path.write(folder.parent / "transforms.json")
+    written = json.loads((folder.parent / "transforms.json").read_text())["frames"]
+    assert [(folder.parent / frame["file_path"]).suffix for frame in written] == [".png"] * (FRAMES - 1)
+    assert all((folder.parent / frame["file_path"]).is_file() for frame in written)
     assert [pose["converged"] for pose in json.loads((folder.parent / "path.json").read_text())] == [
         n != 2 for n in range(FRAMES)
     ]
