@@ -383,7 +383,7 @@ def run_import(
         SettingsGroup("settings of the importer", "What the importer cannot find in the file.", _importer_settings),
     ] = None,
 ) -> None:
-    """Build a map from a COLMAP model, or from a field trained elsewhere.
+    """Build a map from a COLMAP model, or a field trained elsewhere.
 
     The installed importer that recognizes the file reads it. The command reports what it found: counts, what was left out, and
     the extent, since most files store no unit. With --photos, landmarks are built from photos, as in 'train'; otherwise from
