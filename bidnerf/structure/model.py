@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import os
 from collections import Counter
 from collections.abc import Mapping
@@ -19,12 +20,14 @@ from bidnerf.structure.record import MODEL, TRANSFORMS
 from bidnerf_core.camera import CentralLens, Intrinsics, Raster, colmap_camera
 from bidnerf_core.captures import up_direction
 from bidnerf_core.datasets import frame_entry
-from bidnerf_core.errors import amount
+from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import fit_depth
 from bidnerf_core.geometry import SE3, LengthUnit
 from bidnerf_core.io import write_file
 from bidnerf_core.progress import counter
 
+WIDEST_FIELD = 120.0
+"""Largest horizontal field of view (degrees) of a pinhole camera whose focal length was found."""
 LEAST_DEPTHS = 30
 """Smallest number of points with measured depth that determine the scale of a model."""
 
@@ -129,6 +132,56 @@ def count_contradictions(model: Any, database: Any, pycolmap: Any) -> tuple[int,
         pairs += 1
         contradicting += int(np.mean(away * camera.mean_focal_length() < 4) < 0.5)
     return pairs, contradicting
+
+
+def require_parallax(model: Any, database: Any, photos: PhotoSet, source: Path, pycolmap: Any) -> None:
+    """Raise ``InputError`` if the cameras of a model were bent until photos from one place seemed to be from several.
+
+    A focal length that is searched for can explain a mere turn by a walk. The matches of most pairs then fit a rotation of the
+    rays, for one focal length and one distortion among those of usual lenses, as well as keypoints are measured.
+    """
+    for number, camera in model.cameras.items():
+        degrees = math.degrees(2 * math.atan(camera.width / 2 / camera.mean_focal_length()))
+        if number not in photos.fixed and degrees > WIDEST_FIELD:
+            raise InputError(
+                f"the photos fit a camera that sees {degrees:.0f} degrees, which no pinhole camera does",
+                where=source,
+                expected="their camera, such as a fisheye lens; or pinhole views cut from panoramas",
+            )
+    by_number, pairs = {photo.number: photo for photo in photos.photos}, list[np.ndarray]()
+    for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
+        numbers, matches = pycolmap.pair_id_to_image_pair(pair), geometry.inlier_matches
+        if len(matches) >= 30 and not {by_number[n].camera for n in numbers if n in by_number} & photos.fixed:
+            ends = []
+            for number, column in zip(numbers, (0, 1), strict=True):
+                size = np.array(by_number[number].reduced)
+                seen = database.read_keypoints(number)[matches[:, column], :2].astype(np.float64)
+                ends.append((seen - size / 2) / size.max())
+            if np.median(np.linalg.norm(ends[1] - ends[0], axis=-1)) > 0.03:  # of the longer side
+                pairs.append(np.stack(ends))
+    pairs = pairs[:: max(1, len(pairs) // 40)]
+    side = max(max(photo.reduced) for photo in photos.photos)
+    lenses = itertools.product(
+        np.geomspace(0.4, 3, 25), np.linspace(-0.25, 0.25, 11)
+    )  # focal length, radial distortion
+    misfits = [np.median([_misfit_of_turn(ends, *lens) for ends in pairs]) for lens in lenses if len(pairs) >= 3]
+    if misfits and min(misfits) < max(0.7 / side, 0.0012):
+        raise InputError(
+            "the photos were taken from one place, by a camera that only turns: they do not determine distances",
+            where=source,
+            expected="photos taken while moving sideways, or depth",
+        )
+
+
+def _misfit_of_turn(ends: np.ndarray, focal: float, k: float) -> float:
+    """Return the 80th percentile of the distances (relative to the longer side) of matches (2, n, 2) after the best rotation."""
+    flat = ends / focal
+    flat = flat * (1 + k * (flat**2).sum(-1, keepdims=True))
+    rays = np.concatenate([flat, np.ones_like(flat[..., :1])], axis=-1)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    U, _, Vt = np.linalg.svd(rays[1].T @ rays[0])
+    turned = rays[0] @ (U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt).T
+    return float(np.percentile(np.linalg.norm(turned - rays[1], axis=-1), 80) * focal)
 
 
 def reasons_left_out(

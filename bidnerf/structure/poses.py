@@ -28,6 +28,7 @@ from bidnerf.structure.model import (
     reasons_left_out,
     reconstruct,
     relative_path,
+    require_parallax,
     restore_size,
     scale_to_depth,
     turn_upright,
@@ -101,7 +102,6 @@ def find_poses(
             if record is not None and record.inputs == inputs:
                 log.info(f"{folder}: already has the poses of these photos")
                 return record
-    refuse_panoramas(images)
     resumes = interrupted_work(folder).get("inputs") == inputs
 
     def describe_content(folder: Path) -> str | None:
@@ -145,6 +145,7 @@ def _search(
     threads = max(1, torch.get_num_threads())
     if not isinstance(images, list):
         images = write_frames(images, folder / FRAMES, choose_frames(measure_frames(images)))
+    refuse_panoramas(images)
     photos = list_photos(images, camera)
     try:
         stored = pycolmap.Database.open(database)
@@ -178,6 +179,7 @@ def _search(
                 where=source,
                 expected="photos that overlap by two thirds, taken while moving sideways",
             )
+        require_parallax(models[0], opened, photos, source, pycolmap)
         model, by_number = models[0], {photo.number: photo for photo in photos.photos}
         sure, contradicting = count_contradictions(model, opened, pycolmap)
     error = model.compute_mean_reprojection_error()

@@ -8,6 +8,7 @@ camera rests, many while it turns.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +34,7 @@ from bidnerf_core.datasets import (
     warn_about,
 )
 from bidnerf_core.errors import InputError
-from bidnerf_core.io import open_binary
+from bidnerf_core.io import open_binary, read_header, read_image
 from bidnerf_core.progress import counter
 from bidnerf_core.training import sharpness
 
@@ -137,16 +138,35 @@ def photos_of(
 
 
 def refuse_panoramas(photos: Sequence[SourceImage]) -> None:
-    """Raise ``InputError`` for photos that are panoramas according to their XMP, since no pinhole camera describes them."""
+    """Raise ``InputError`` for panoramas, since no pinhole camera describes them.
+
+    A photo is one according to its XMP, and most photos that are twice as wide as high and whose left edge continues the
+    right one are.
+    """
+    joined, expected = (
+        list[bool](),
+        "poses with camera_model EQUIRECTANGULAR in transforms.json, or pinhole views cut from it",
+    )
     for photo in photos:
-        try:
-            with open_binary(photo.file, "a photo") as file:
-                head = file.read(2**18)  # contains the XMP: a segment has at most 64 KiB, and EXIF precedes it
-        except InputError:  # left out later
-            continue
+        head = b""
+        with contextlib.suppress(InputError), open_binary(photo.file, "a photo") as file:  # left out later
+            head = file.read(2**18)  # contains the XMP: a segment has at most 64 KiB, and EXIF precedes it
+            joined += [_edges_continue(photo.file)] if len(joined) < 20 else []
         if b"equirectangular" in head:
-            expected = "poses with camera_model EQUIRECTANGULAR in transforms.json, or pinhole views cut from it"
             raise InputError("is a panorama (equirectangular)", where=photo.file, expected=expected)
+    if sum(joined) > len(joined) / 2:
+        found = "is twice as wide as high and its edges continue each other, as in a panorama (equirectangular)"
+        raise InputError(found, where=photos[0].file.parent, expected=expected)
+
+
+def _edges_continue(photo: Path) -> bool:
+    """Return whether a photo is twice as wide as high and its edges differ hardly more than neighbouring columns do."""
+    header = read_header(photo)
+    if abs(header.width - 2 * header.height) > 1:
+        return False
+    rgb, _ = read_image(photo, size=reduced_size(header.width, header.height, 512))
+    steps = (rgb - rgb.roll(1, 1)).abs().mean((0, 2))  # the first is that from the right edge to the left one
+    return bool(steps[0] < 3 * steps[1:].median())
 
 
 def measure_frames(frames: Frames) -> list[Measure]:

@@ -87,3 +87,16 @@ def test_what_lies_beside_photos_is_no_photo_and_is_named(tmp_path: Path, names:
     texts = [str(warning.message) for warning in caught]
     assert len(texts) == (remark is not None)
     assert all(text.startswith(f"{tmp_path}: {remark}") for text in texts)
+
+
+def test_pictures_whose_edges_continue_each_other_are_panoramas_without_xmp(tmp_path: Path) -> None:
+    columns = np.linspace(0, 2 * np.pi, 120, endpoint=False)
+    for number in range(3):
+        joined = 128 + 100 * np.sin(columns + number)[None].repeat(60, 0)[..., None].repeat(3, 2)
+        Image.fromarray(joined.astype(np.uint8)).save(tmp_path / f"{number}.png")
+    with refused(where=tmp_path, found="edges continue each other", expected="EQUIRECTANGULAR"):
+        refuse_panoramas(photos_of(tmp_path))
+    for number in range(3):
+        ramp = np.linspace(0, 255, 120)[None].repeat(60, 0)[..., None].repeat(3, 2)
+        Image.fromarray(ramp.astype(np.uint8)).save(tmp_path / f"{number}.png")
+    refuse_panoramas(photos_of(tmp_path))

@@ -371,6 +371,14 @@ def test_a_recording_without_poses_is_photos_with_a_camera_and_depth(tmp_path: P
         assert torch.stack(steps) == pytest.approx(torch.stack(truth), rel=0.03)
 
 
+def test_a_camera_that_only_turns_is_refused_though_its_focal_length_is_unknown(tmp_path: Path) -> None:
+    eye = walk(1)[0].translation
+    turn = [bn.SE3(pose.rotation, eye) for pose in walk(PLACED)]
+    write_photos(tmp_path / "photos", turn)
+    with refused(where=tmp_path / "photos", found="a camera that only turns", expected="moving sideways"):
+        bn.find_poses(tmp_path / "photos", tmp_path / "poses")
+
+
 def test_upright_axes_are_those_of_the_turned_image(tmp_path: Path) -> None:
     """The brightest corner of the upright image lies where its axes say, for all eight orientations."""
     from bidnerf.structure.model import _upright_axes
