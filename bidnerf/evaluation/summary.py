@@ -119,7 +119,7 @@ def _condition(result: TrialResult) -> dict[str, Any]:
     masks = trial.images.masks
     return {
         "method": result.method,
-        "images": len(trial.frames),
+        "frames": len(trial.frames),
         "hidden": None if masks is None else f"{trial.images.mask_hides} of {masks}",
         "depth": trial.depth,
         **options,
@@ -130,7 +130,7 @@ def _condition(result: TrialResult) -> dict[str, Any]:
 
 
 WORDS: dict[str, Callable[[Any], str]] = {
-    "images": lambda count: amount(count, "image"),
+    "frames": lambda count: amount(count, "image"),
     "depth": lambda used: "RGB-D" if used else "RGB",
     "hidden": lambda masks: "nothing hidden" if masks is None else f"{masks} hidden",
     "backend": str,

@@ -205,7 +205,7 @@ def test_masks_hide_parts_of_the_images_in_every_trial(shared: Path, masks: Mask
     assert len({result[0].loss for result in (whole, black, white)}) == 3
     given, hidden = (
         (bn.load_map(scene), open_dataset(data, masks=hiding[1])),
-        DatasetOptions(None, "test", masks=hiding[1]),
+        DatasetOptions(split="test", masks=hiding[1]),
     )
     in_memory = bn.evaluate(*given, quick(trials=2, seed=5))
     again = bn.evaluate(scene, data, quick(trials=2, seed=5, images=hidden))
@@ -309,7 +309,7 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
             "camera is a Intrinsics",
             "text, a number or the path of a file",
         ),
-        ({"images": DatasetOptions("cam.json", "test")}, "leave out `camera`", None),
+        ({"images": DatasetOptions("cam.json", split="test")}, "leave out `camera`", None),
         ({"scene": BLOBS, "workers": 0}, "workers is 0", "1 or more"),
         ({"scene": BLOBS, "workers": -1}, "workers is -1", "1 or more"),
         ({"seed": -1}, "seed is -1", "a whole number, 0 to 2,147,483,647"),
