@@ -20,6 +20,22 @@ from bidnerf_core.io import IMAGE_SUFFIXES, is_file
 from bidnerf_core.io import Background as Background  # for authors of readers
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
 
+UNREAD_VIDEOS = (
+    ".h264",
+    ".h265",
+    ".264",
+    ".265",
+    ".hevc",
+    ".wmv",
+    ".flv",
+    ".y4m",
+    ".ogv",
+    ".vob",
+    ".insv",
+    ".360",
+    ".mjpeg",
+)
+"""The extensions of videos without times or in containers that are not opened."""
 Match = TypeVar("Match")
 OpenQuestion = Literal["camera", "focal", "register_depth", "depth_unit", "images"]
 """An option of ``DatasetOptions`` that a format may leave open."""
@@ -303,6 +319,10 @@ def no_dataset(path: Path, readers: Sequence[Reader] | None = None, or_else: str
     if not path.is_dir():
         if (instead := file_of_dataset(path)) is not None:
             return InputError(f"{instead}{or_else}", where=path)
+        if path.suffix.lower() in UNREAD_VIDEOS:
+            return InputError(
+                "is a video in a container that is not read", where=path, expected="MP4: convert it first"
+            )
         return InputError(
             "is a file", where=path, expected=f"the folder of a dataset{or_else}; unpack an archive first"
         )

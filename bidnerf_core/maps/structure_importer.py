@@ -65,7 +65,7 @@ class StructureImporter:
         if source is not None and config.keypoints != "photos":
             counts = {image.name: len(image.observed) for image in images}
             stored = stored_keypoints(source, counts)
-            why = _misfit(stored, counts, [s.camera for s in shots])
+            why = _misfit(stored, counts, [s.camera for s in shots], source.suffix != ".h5")
             if why is None:
                 known = stored
             elif given is not None:
@@ -114,7 +114,9 @@ def _numbers(observed: Tensor, ids: Tensor, sound: Tensor) -> Tensor:
     return torch.where((ids[index] == observed) & sound[index], index, -1)
 
 
-def _misfit(known: Mapping[str, Keypoints], counts: Mapping[str, int], cameras: list[object]) -> str | None:
+def _misfit(
+    known: Mapping[str, Keypoints], counts: Mapping[str, int], cameras: list[object], is_database: bool
+) -> str | None:
     """Return why stored keypoints cannot be used for images with these ``counts`` of keypoints; None if they can."""
     named = [name for name in counts if name in known]
     if not named:
@@ -122,6 +124,8 @@ def _misfit(known: Mapping[str, Keypoints], counts: Mapping[str, int], cameras: 
     for name in named:
         if counts[name] != len(known[name]):
             return f"it has {len(known[name])} keypoints of {name}, the model {counts[name]}"
+        if is_database and (width := known[name].descriptors.shape[1]) != 128:
+            return f"its descriptors have {width} bytes, those of SIFT 128"
     if not all(isinstance(camera, Intrinsics) for camera in cameras):
         return "its keypoints are those of lenses whose images are undistorted"
     return None

@@ -307,6 +307,7 @@ def test_pipes_are_refused_or_left_out_and_do_not_hang(tmp_path: Path) -> None:
 def test_a_folder_that_is_no_dataset(tmp_path: Path) -> None:
     folder = LAYOUTS["transforms"].write(tmp_path / "sound", small_views(2))
     (tmp_path / "scan.zip").write_bytes(b"PK")
+    (tmp_path / "pi.h264").write_bytes(b"\0\0\0\1")
     for name in ("empty", "notes"):
         (tmp_path / name).mkdir()
     (tmp_path / "notes/notes.txt").touch()
@@ -314,6 +315,7 @@ def test_a_folder_that_is_no_dataset(tmp_path: Path) -> None:
         ("none", "no such folder", "a dataset"),
         (f"sound/{JSON}", f"is a file of a dataset; give its folder, {folder}", None),
         ("scan.zip", "is a file", "the folder of a dataset; unpack an archive first"),
+        ("pi.h264", "is a video in a container that is not read", "MP4"),
         ("empty", "the folder is empty", "photos or a dataset in one of"),
         ("notes", "contains no photos and is no dataset", "photos or a dataset in one of"),
     ):

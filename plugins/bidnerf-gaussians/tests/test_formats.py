@@ -21,6 +21,7 @@ import zstandard
 from PIL import Image
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.io import read_ply
 from bidnerf_core.maps import UNMOVED
 from bidnerf_gaussians import Gaussians, read_gaussians, write_gaussians
 from bidnerf_gaussians.formats import format_of, spz
@@ -85,6 +86,30 @@ def test_discs_of_2d_gaussian_splatting_are_thin_gaussians(tmp_path: Path, some:
     expected = replace(gaussians, log_scales=thin, harmonics=gaussians.harmonics[:, :1])
     assert max(differences(read_gaussians(path), expected).values()) < 1e-5
     assert "2D Gaussian Splatting" in GaussiansImporter().read(path, ImportSettings(), UNMOVED).found[0]
+
+
+def test_plys_of_mip_splatting_and_cloudcompare_are_those_of_splats(tmp_path: Path, some: Some) -> None:
+    """A 3D filter convolves each splat with a Gaussian and keeps its integral; CloudCompare renames what it keeps."""
+    write_gaussians(tmp_path / "plain.ply", plain := some(20))
+    rows = read_ply(tmp_path / "plain.ply", "a PLY")["vertex"]
+    names = rows.dtype.names or ()
+
+    def write(name: str, values: dict[str, np.ndarray]) -> Path:
+        lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+        body = np.stack([column.astype("<f4") for column in values.values()], axis=1).tobytes()
+        head = "\n".join([*lines, *(f"property float {key}" for key in values), "end_header", ""]).encode()
+        (tmp_path / name).write_bytes(head + body)
+        return tmp_path / name
+
+    columns = {name: rows[name] for name in names}
+    renamed = read_gaussians(write("cc.ply", {k if k in "xyz" else f"scalar_{k}": v for k, v in columns.items()}))
+    assert torch.equal(renamed.log_scales, read_gaussians(tmp_path / "plain.ply").log_scales)
+    filtered = read_gaussians(write("mip.ply", columns | {"filter_3D": np.full(len(rows), 0.05)}))
+    assert torch.allclose(filtered.log_scales.exp() ** 2, plain.log_scales.exp() ** 2 + 0.05**2, rtol=1e-4)
+    integral = [g.opacities * g.log_scales.sum(-1).exp() for g in (filtered, plain)]
+    assert torch.allclose(*integral, rtol=1e-3)
+    with pytest.raises(InputError, match="has motion_0: its splats move"):
+        read_gaussians(write("moving.ply", columns | {"motion_0": np.zeros(len(rows))}))
 
 
 def test_an_spz_has_other_axes_than_a_ply(tmp_path: Path, some: Some) -> None:

@@ -32,7 +32,9 @@ def recognises(path: Path) -> bool:
     """Return whether the file is a PLY with the properties of the original 3DGS code."""
     header = _header(path)
     vertex = None if header is None else header.elements.get("vertex")
-    return vertex is not None and {"opacity", "scale_0", "rot_0"} <= set(vertex.properties)
+    return vertex is not None and {"opacity", "scale_0", "rot_0"} <= {
+        name.removeprefix("scalar_") for name in vertex.properties
+    }
 
 
 def recognises_discs(path: Path) -> bool:
@@ -65,9 +67,14 @@ def read(path: Path) -> Gaussians:
     """
     vertices = _vertices(read_ply(path, EXPECTED), path)
     names = vertices.dtype.names or ()
+    if any(name.startswith("scalar_") for name in names):  # as CloudCompare calls the properties that it keeps
+        vertices = vertices.view([(name.removeprefix("scalar_"), vertices.dtype[name]) for name in names])
+        names = vertices.dtype.names or ()
     missing = [name for name in NEEDED if name not in names and name != "scale_2"]
     if missing:
         raise InputError(f"has no property {', '.join(missing)}", where=path, expected=EXPECTED)
+    if moving := next((name for name in names if name.startswith(("motion_", "trbf_", "omega_"))), None):
+        raise InputError(f"has {moving}: its splats move", where=path, expected="a scene at rest")
     rest = sum(name.startswith("f_rest_") for name in names)
     harmonics = _columns(vertices, COLOUR)[:, None]
     if rest:
@@ -75,13 +82,12 @@ def read(path: Path) -> Gaussians:
     scales = _columns(vertices, SCALES if "scale_2" in names else SCALES[:2])
     if scales.shape[1] == 2:
         scales = np.concatenate([scales, scales.min(axis=1, keepdims=True) + np.float32(DISC)], axis=1)
-    return gaussians_of(
-        _columns(vertices, MEANS),
-        scales,
-        _columns(vertices, TURNS),
-        vertices["opacity"],
-        harmonics,
-    )
+    opacity = vertices["opacity"]
+    if "filter_3D" in names:  # of Mip-Splatting: convolved with a Gaussian, whose integral stays the same
+        wider = 0.5 * np.logaddexp(2 * scales, 2 * np.log(_columns(vertices, ("filter_3D",)).clip(1e-20)))
+        share = np.exp((scales - wider).sum(axis=1)) / (1 + np.exp(-opacity.astype(np.float64)))
+        scales, opacity = wider.astype(np.float32), logit(share).astype(np.float32)
+    return gaussians_of(_columns(vertices, MEANS), scales, _columns(vertices, TURNS), opacity, harmonics)
 
 
 def _vertices(elements: Mapping[str, np.ndarray], path: Path) -> np.ndarray:
