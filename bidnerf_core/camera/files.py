@@ -92,7 +92,7 @@ DISTORTIONS = {
 }
 """The names of distortion models in calibrations, in lower case, by our kind of model."""
 EXPECTED_YAML = "YAML from ROS (camera_info), OpenCV, ORB-SLAM or Kalibr with the intrinsics of one camera"
-FORMATS = (
+CAMERA_FORMATS = (
     "a camera: JSON (fl_x or fx, K, mtx or camera_matrix), YAML of ROS, OpenCV or Kalibr, COLMAP's cameras.txt (from cameras.bin:"
     " model_converter), ROS's ost.txt, XML of OpenCV or Agisoft, or a 3x3 matrix as text"
 )
@@ -199,7 +199,7 @@ def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> 
     if start[:1] == b"[" and start[1:].lstrip()[:1] == b"{":
         return _choose(path, _splat_cameras(path, content), photo)
     if re.match(rb"\[\s*[\[\d.+-]", start):
-        return parse_calibration(str(path), {"K": parse_json(content, str(path), FORMATS)}, size)
+        return parse_calibration(str(path), {"K": parse_json(content, str(path), CAMERA_FORMATS)}, size)
     if start[:1] in (b"{", b"["):
         return _json_camera(parse_record(str(path), content), size)
     if start.startswith((b"%YAML", b"---")) or path.suffix.lower() in (".yaml", ".yml"):
@@ -209,7 +209,7 @@ def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> 
         return parse_calibration(str(path), values, size)
     if start[:1] == b"<":
         return _xml_camera(path, content, size)
-    rows = parse_rows(content, path, FORMATS, "CAMERA_ID MODEL WIDTH HEIGHT and parameters")
+    rows = parse_rows(content, path, CAMERA_FORMATS, "CAMERA_ID MODEL WIDTH HEIGHT and parameters")
     numbers = [float(word) for row in rows[:4] for word in row.words if NUMBER.fullmatch(word)]
     # A matrix of 3x3, 3x4 or 4x4, in one row or in several.
     width = {9: 3, 12: 4, 16: 4}.get(len(numbers))
@@ -230,13 +230,13 @@ def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> 
 
 def _xml_camera(path: Path, content: bytes, size: tuple[int, int]) -> Camera:
     """Read the XML of OpenCV's ``FileStorage``, or of a lens of Agisoft."""
-    root = parse_xml(content, str(path), FORMATS)
+    root = parse_xml(content, str(path), CAMERA_FORMATS)
     if root.tag == "opencv_storage":
         texts = {node.tag: (node.findtext("data") or node.text or "").split() for node in root}
         return parse_calibration(str(path), {key: t if len(t) > 1 else "".join(t) for key, t in texts.items()}, size)
     sides = [root.findtext(side) or "" for side in ("width", "height")]
     if root.tag != "calibration" or not all(side.isdecimal() and len(side) < 9 for side in sides):
-        raise InputError("is no camera", where=path, expected=FORMATS)
+        raise InputError("is no camera", where=path, expected=CAMERA_FORMATS)
     return agisoft_camera(str(path), root.findtext("projection") or "frame", (int(sides[0]), int(sides[1])), root)
 
 
@@ -335,7 +335,7 @@ def read_text_cameras(path: Path) -> dict[int, Camera]:
 
 def _text_cameras(path: Path, content: bytes, named: bool = True) -> dict[str, Camera]:
     """Parse rows of ``CAMERA_ID MODEL WIDTH HEIGHT PARAMS...``, or hloc's rows with an image name instead of the id."""
-    expected = f"a camera: {FORMATS}"
+    expected = f"a camera: {CAMERA_FORMATS}"
     cameras: dict[str, Camera] = {}
     for row in parse_rows(content, path, expected, "CAMERA_ID MODEL WIDTH HEIGHT and parameters"):
         words = row.words
