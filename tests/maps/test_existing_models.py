@@ -192,6 +192,11 @@ def test_keypoints_of_another_model_are_not_used(
     given = {"keypoints": str(model.folder / "database.db")}
     with refused(where="database.db", found="keypoints of 000.png, the model", expected="the keypoints of"):
         bn.import_map(model.folder, None, given)
+    model.write_database(tmp_path / "aliked.db")
+    with contextlib.closing(sqlite3.connect(tmp_path / "aliked.db")) as opened, opened:
+        opened.execute("UPDATE descriptors SET cols = 4 * cols, data = zeroblob(4 * rows * cols)")
+    with refused(where="aliked.db", found="its descriptors have 512 bytes, those of SIFT 128"):
+        bn.import_map(model.folder, None, {"keypoints": str(tmp_path / "aliked.db")})
     (tmp_path / "other.db").write_bytes(b"no database")
     with refused(where="other.db", found="cannot be read", expected="a database of COLMAP"):
         bn.import_map(model.folder, None, {"keypoints": str(tmp_path / "other.db")})

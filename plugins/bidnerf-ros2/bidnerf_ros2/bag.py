@@ -203,7 +203,11 @@ def _topics(path: Path) -> Topics:
     info = _info_beside(image, infos)
     camera = intrinsics(first[info], rectified="rect" in image.rpartition("/")[2])
     depths = [t for t in counts if is_depth(first[t]) and _fits(first[t], camera)]
-    depth = max(depths, key=lambda topic: counts[topic], default=None)
+    others = [t for t in depths if (i := _info_beside(t, infos)) in infos and not _same_lens(first[i], camera)]
+    if others:
+        log.info("%s: depth of %s is that of another camera and is left out", path, ", ".join(others))
+    registered = [topic for topic in depths if topic not in others]
+    depth = max(registered, key=lambda topic: ("aligned" in topic, counts[topic]), default=None)
     return Topics(image, info, depth, camera, counts[image], span / max(counts[image], counts[depth]) if depth else 0.0)
 
 
@@ -212,6 +216,13 @@ def _info_beside(image: str, infos: set[str]) -> str:
     namespace = image.rpartition("/")[0]
     names = [f"{space}/camera_info" for space in (namespace, namespace.rpartition("/")[0])]
     return next((name for name in names if name in infos), names[0])
+
+
+def _same_lens(info: Any, camera: Intrinsics) -> bool:
+    """Return whether the camera info of a depth topic is that of the colour camera, to which depth is then registered."""
+    own = intrinsics(info, rectified=True).resized(camera.width, camera.height)
+    shift = abs(own.cx - camera.cx) + abs(own.cy - camera.cy)
+    return abs(own.fx / camera.fx - 1) < 0.01 and shift < 0.02 * camera.width
 
 
 def _fits(depth: Any, camera: Intrinsics) -> bool:

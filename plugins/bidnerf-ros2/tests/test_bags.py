@@ -13,6 +13,7 @@ from PIL import Image
 
 import bags
 from bidnerf import InputError, open_dataset, open_sequence
+from bidnerf_ros2.bag import _same_lens
 from bidnerf_ros2.messages import colour_image, depth_image, intrinsics, is_depth
 
 CAMERA = (30.0, 31.0, 15.5, 11.5)
@@ -55,6 +56,21 @@ def test_depth_that_was_not_recorded_is_missing(tmp_path: Path) -> None:
     assert [timed.frame.depth is not None for timed in found] == [depth is not None for *_, depth in some]
     none = [(time, colour, None) for time, colour, _ in MOMENTS]
     assert all(timed.frame.depth is None for timed in open_sequence(bags.write(tmp_path / "c", none, CAMERA)))
+
+
+def test_the_lens_of_a_depth_camera_decides_whether_its_depth_is_registered() -> None:
+    roi = SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0, do_rectify=False)
+    camera = SimpleNamespace(distortion_model="plumb_bob", d=[0.0] * 5, r=np.eye(3), roi=roi, binning_x=0, binning_y=0)
+
+    def info(fx: float, cx: float, factor: float = 1.0) -> SimpleNamespace:
+        K = np.array([[fx, 0, cx], [0, fx, 240], [0, 0, 1 / factor]]) * factor
+        P = np.concatenate([K, np.zeros((3, 1))], 1).ravel()
+        size = {"width": round(640 * factor), "height": round(480 * factor)}
+        return SimpleNamespace(**{**vars(camera), **size, "k": K.ravel(), "p": P})
+
+    colour = intrinsics(info(600, 320), rectified=True)
+    fits = [_same_lens(each, colour) for each in (info(600, 320), info(600, 320, 0.5), info(420, 320), info(600, 350))]
+    assert fits == [True, True, False, False]
 
 
 def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
