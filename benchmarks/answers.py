@@ -5,7 +5,7 @@ r"""Answers on record: what the localizer says to the same images, before and af
     python benchmarks/answers.py --compare A.jsonl [B.jsonl]
     python benchmarks/answers.py --record A.jsonl [A2.jsonl ...] [--name answers]
 
-MAP is the name of a dataset in the folder ``BIDNERF_DATA`` whose map ``answer_maps.py`` has put into the folder
+MAP is the name of a dataset in the folder ``BIDNERF_DATA``, or that name, @ and the number of a half of its training images, whose map ``answer_maps.py`` has put into the folder
 ``BIDNERF_MAPS``, or ``planes``, the scenes of ``planar_scenes.py``. Images that training never saw are localized without a
 start and on one thread, with depth and without, under the conditions that the table ``CONDITIONS`` lists. Each answer is kept
 as a row with its pose, covariance (upper triangle, single precision), outcome, reason, confidence, errors and CPU time. The
@@ -56,7 +56,7 @@ from _lab import (
     within,
     without_depth,
 )
-from answer_maps import folder_of, map_folder
+from answer_maps import data_folder, folder_of, map_folder
 from repeated_scene import copies, double
 from scipy.stats import binomtest
 from torch import Generator, Tensor
@@ -287,10 +287,11 @@ class Subject:
         if not folder.is_dir():
             raise InputError(f"{folder}: no such map, expected one; answer_maps.py {name} trains it")
         self.name = name
-        self.scene = Scene.open(f"{folder}:{folder_of('BIDNERF_DATA') / name}")
+        self.scene = Scene.open(f"{folder}:{data_folder(name)}")
         self.content = self.scene.key
         self.localizer = Localizer(self.scene.map)
-        place = SCENES.index(name) if name in SCENES else 0
+        scene = data_folder(name).name
+        place = SCENES.index(scene) if scene in SCENES else 0
         self.others = [SCENES[(place + step) % len(SCENES)] for step in (1, 2)]
 
     @cached_property
