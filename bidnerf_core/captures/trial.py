@@ -22,7 +22,6 @@ from bidnerf_core.geometry import KEYPOINTS_PER_INDEPENDENT, SE3
 from bidnerf_core.localization import (
     HEAVY_TAILS,
     LANDMARK_BOUNDS,
-    Images,
     LandmarkAnswer,
     LandmarkMatcher,
     Loop,
@@ -30,7 +29,6 @@ from bidnerf_core.localization import (
     SceneMap,
     Surface,
     rig,
-    small_images,
     states_at,
 )
 from bidnerf_core.mapping import (
@@ -131,9 +129,9 @@ def tried_field(scene: SceneMap, views: Sequence[View], trial: HeldOutTrial) -> 
             if points is not None:
                 terms["points"] = points.fitted_noise(here)
         if has_field(scene.field):
-            rays = RenderedRays.of(problem.views, problem.field, problem.bounds, 1024, number)
-            terms["rays"] = rays.fitted(here)
-            differences.append(float(small_images(problem, 64)(here).cost) / Images.INDEPENDENT)
+            rays = RenderedRays.of(problem.views, problem.field, problem.bounds, 1024, number, steep=True)
+            terms["rays"] = rays = rays.fitted(here)
+            differences.append(float(rays.loss_at(here)))
         for name, term in terms.items():
             normal = term(here)
             factor, info = torch.linalg.cholesky_ex(normal.hessian[0, :6, :6])

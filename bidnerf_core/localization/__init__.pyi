@@ -64,7 +64,6 @@ from .settings import ReachSettings as ReachSettings
 from .settings import TrackerConfig as TrackerConfig
 from .settings import objective_of as objective_of
 from .terms.images import Images as Images
-from .terms.images import small_images as small_images
 from .terms.images import surface_renderer as surface_renderer
 from .terms.rays import RenderedRays as RenderedRays
 from .terms.sampled import SampledLoss as SampledLoss

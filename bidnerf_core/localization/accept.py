@@ -53,13 +53,21 @@ class Evidence:
     searched: bool  # whether the pose was found by landmarks, not only confirmed by them
     on_surface: float | None = None  # fraction of the measured points on the surface
     colour_inliers: float | None = None  # fraction of the measured points on the surface and with its colour
-    # difference between a small image and its rendering, relative to the usual one of the map's own images; None if not rendered
+    # mean robust loss of the rays relative to the usual one of the map's own images; None if no rays were rendered
     difference: float | None = None
 
     @property
     def above_chance(self) -> float:
         """Ratio of the number of inliers to the number expected at a wrong pose, with one added to both."""
         return (1 + self.inliers) / (1 + self.by_chance)
+
+    @property
+    def violated(self) -> Iterator[tuple[Bound, float]]:
+        """The bounds of ``LANDMARK_BOUNDS`` that the evidence violates, each paired with the value of its measure."""
+        for bound in LANDMARK_BOUNDS if self.searched else LANDMARK_BOUNDS[1:]:
+            value = getattr(self, bound.measure)
+            if value is not None and not bound.keeps(value):
+                yield bound, value
 
 
 class Bound(NamedTuple):
@@ -79,7 +87,7 @@ class Bound(NamedTuple):
 
 LANDMARK_BOUNDS = (
     Bound("log10_nfa", -12.0, False, Outcome.TOO_FEW_MATCHES, "{0:.0e} poses as good are expected by chance"),
-    Bound("inliers", 15, True, Outcome.TOO_FEW_MATCHES, "only {0:.0f} landmark inliers"),
+    Bound("inliers", 15, True, Outcome.TOO_FEW_MATCHES, "only {0:.0f} landmark inliers", True),
     Bound("above_chance", 3.0, True, Outcome.AMBIGUOUS, "only {0:.1f} times as many landmarks match as by chance"),
     Bound("spread", 0.06, True, Outcome.UNDETERMINED, "the landmarks are all in {0:.0%} of the image"),
     Bound("other_place", 0.02, False, Outcome.AMBIGUOUS, "another place fits with a probability of {0:.0%}", True),
@@ -112,11 +120,9 @@ def judge(evidence: Evidence, log_odds: float = 0.0) -> Verdict:
     ``log_odds`` are the prior log odds of the pose, relative to those of an image that may have been taken anywhere.
     """
     confidence = model().probability(features(evidence), log_odds)
-    for bound in LANDMARK_BOUNDS if evidence.searched else LANDMARK_BOUNDS[1:]:
-        value = getattr(evidence, bound.measure)
-        if value is not None and not bound.keeps(value):
-            shown = 10.0 ** min(max(value, -300), 300) if bound.measure == "log10_nfa" else value
-            return Verdict(bound.outcome, bound.reason.format(shown), confidence)
+    for bound, value in evidence.violated:
+        shown = 10.0 ** min(max(value, -300), 300) if bound.measure == "log10_nfa" else value
+        return Verdict(bound.outcome, bound.reason.format(shown), confidence)
     share = f"{evidence.inliers} landmark inliers"
     if confidence < ACCEPTED:
         why = f"{share}, but only {math.floor(100 * confidence)}% likely to be right"

@@ -18,8 +18,8 @@ from torch import Tensor
 from bidnerf_core.devices import run_on
 from bidnerf_core.fields import has_field
 from bidnerf_core.frames import View
-from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.accept import LANDMARK_BOUNDS, Evidence, judge, same_pose
+from bidnerf_core.geometry import KEYPOINTS_PER_INDEPENDENT, SE3
+from bidnerf_core.localization.accept import Evidence, judge, same_pose
 from bidnerf_core.localization.explanations import MOVING, USUAL, Explanations, Proposal, explanations
 from bidnerf_core.localization.matching import (
     CELLS,
@@ -57,11 +57,10 @@ from bidnerf_core.localization.propose import (
     proposals_at,
 )
 from bidnerf_core.localization.result import Outcome, Verdict, current_record
-from bidnerf_core.localization.terms.images import Images, refine_on_small_images, small_images
+from bidnerf_core.localization.terms.images import Images, refine_on_small_images
 from bidnerf_core.localization.terms.rays import RenderedRays
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.mapping import (
-    CAMERA,
     CostTerm,
     Features,
     LandmarkMap,
@@ -118,10 +117,8 @@ class LandmarkAnswer:
 
     @property
     def is_open(self) -> bool:
-        """Whether rendered rays may change the verdict: only they can, and the camera, which they do not determine, is known."""
-        bounds = (bound for bound in LANDMARK_BOUNDS if not bound.is_open)
-        kept = all(bound.keeps(getattr(self.evidence, bound.measure)) for bound in bounds)
-        return kept and bool(self.explanations.usual[int(self.posterior.states.row[self.posterior.best])])
+        """Whether the verdict depends on measures that rendered rays may change."""
+        return all(bound.is_open for bound, _ in self.evidence.violated)
 
     @property
     def explanation(self) -> str:
@@ -396,27 +393,45 @@ class Loop:
         places = [g for g in sorted(range(len(modes)), key=lambda g: -odds[g]) if odds[g] > 1e-3]
         which = torch.tensor([g for g in places if modes[g].name != MIRROR])
         if problem is not None and self.rays and blur > 0.6 and answer.is_open and len(which):
-            # Small images are those of a camera at rest.
-            small = [] if answer.explanation.endswith(MOVING) else places
-            for g in small:
-                here = refine_on_small_images(problem, best[g : g + 1], blur, modes[g].name == MIRROR)
-                best = best.with_rows(torch.tensor([g]), here)
             where = "cpu" if problem.device == self.device else None
-            rays = RenderedRays.of(problem.views, problem.field, problem.bounds, self.rays, self.seed, device=where)
-            minima, by_rays = run_on(self.device, fit_with_rays, best, terms, rays, given, which)
-            difference = torch.full((len(modes),), torch.nan, dtype=torch.float64)
-            for g in small:
-                there = minima[0].here[g : g + 1]
-                images = small_images(problem, 64, there.nuisances[0, CAMERA], modes[g].name == MIRROR)
-                difference[g] = images(there).cost[0] / Images.INDEPENDENT
-            # Neighbouring rays share the field's errors, which the scatter of the rays' gradients does not show.
-            systematic = (self.landmarks.trial.rays - 1) * by_rays
-            # Rays about one camera's pose must not decide between cameras, but may decide between places.
+            rays = RenderedRays.of(
+                problem.views, problem.field, problem.bounds, self.rays, self.seed, device=where, steep=True
+            )
+            # The descent begins at the camera with which some rays agree best, of the most probable ones.
+            likely = found.probability.argsort(descending=True)[:8]
+            some = minima[1][likely]
+            few = rays.first(256)
+            loss = few.loss_at(some)
+            score = found.probability[likely].log() - Images.INDEPENDENT * loss
+            for g in which:
+                first = torch.where(some.mode == g, score, -torch.inf).argmax()[None]
+                here = some[first]
+                # The pose of a camera at rest that may be as stated is first refined where rays would be too fine.
+                if bool(given.usual[here.row]) and not given.names[int(here.row)].endswith(MOVING):
+                    coarse = refine_on_small_images(problem, here, blur)
+                    here = coarse if float(few.loss_at(coarse)) < float(loss[first]) else here
+                best = best.with_rows(g[None], here)
+            for _ in range(3):  # as above
+                row = best.row
+                minima, best, weights, by_rays, loss = run_on(
+                    self.device, fit_with_rays, best, terms, rays, given, which
+                )
+                if torch.equal(best.row[which], row[which]):
+                    break
+            for g in set(places) - set(which.tolist()):
+                loss[g] = replace(rays, sights=rays.sights.mirrored).loss_at(best[g : g + 1])[0]
             # A place that was not rendered counts as if the map showed it as well as any other.
-            log_odds = -Images.INDEPENDENT * difference.nan_to_num(float(difference.nan_to_num(1.0).amin()))
-            found = self._posterior(minima, landmarks, log_odds, systematic, found.log)
-            if small and self.landmarks.trial.difference > 0:
-                others["difference"] = float(difference[found.mode]) / self.landmarks.trial.difference
+            log_odds = -Images.INDEPENDENT * loss.nan_to_num(float(loss.nan_to_num(torch.inf).amin()))
+            # Neighbouring rays share the field's errors, which the scatter of the rays' gradients does not show; it shows even
+            # less of the errors of rays that agree less than usual, and of a camera that rays determine together with the pose.
+            trial, states = self.landmarks.trial, minima[1]
+            difference = loss / trial.difference if trial.difference > 0 else torch.full_like(loss, torch.nan)
+            factor = trial.rays * difference.nan_to_num(1.0).clamp(min=1.0).square()[states.mode]
+            factor = torch.where(given.usual[states.row], factor, KEYPOINTS_PER_INDEPENDENT * factor)
+            systematic = (factor - 1)[:, None, None] * by_rays[states.mode]
+            found = self._posterior(minima, landmarks, log_odds, systematic, weights)
+            if trial.difference > 0:
+                others["difference"] = float(difference[found.mode])
             answer = self._judged(found, modes, landmarks, given, searched, others)
             fused.append("rendering")
         return replace(answer, fused=tuple(fused))
@@ -432,7 +447,7 @@ class Loop:
         landmarks: Landmarks,
         log_odds: Float[Tensor, "g"] | float = 0.0,
         systematic: Tensor | float = 0.0,
-        log_weights: Float[Tensor, "h"] | None = None,
+        weights: Float[Tensor, "h"] | None = None,
     ) -> Posterior:
         """Return the posterior over the explanations; ``log_odds`` between the modes come from measurements other than landmarks."""
         quadratic, states, normal = minima
@@ -444,9 +459,7 @@ class Loop:
             # In six dimensions, the density of a normal distribution of unknown width falls with the sixth power of the distance.
             log_odds = log_odds - 6.0 * away.clamp(min=1e-9).log()
         scatter = self.landmarks.calibration_scatter.double()
-        return Posterior.of(
-            states, normal, quadratic, landmarks, scatter, systematic, log_odds, log_weights, self.device
-        )
+        return Posterior.of(states, normal, quadratic, landmarks, scatter, systematic, log_odds, weights, self.device)
 
     def _judged(
         self,

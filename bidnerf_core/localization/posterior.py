@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bidnerf_core.devices import run_on
-from bidnerf_core.geometry import SE3
+from bidnerf_core.devices import move_to, run_on
+from bidnerf_core.geometry import KEYPOINTS_PER_INDEPENDENT, SE3
 from bidnerf_core.localization.explanations import Explanations
 from bidnerf_core.localization.terms.rays import RenderedRays
 from bidnerf_core.localization.terms.surface import Surface
@@ -46,7 +46,6 @@ class Posterior:
     probability: Float[Tensor, "h"]
     covariance: Float[Tensor, "h 6 6"]  # of the pose under each explanation
     update: Float[Tensor, "h 6"]  # from the pose of the most probable explanation
-    log: Float[Tensor, "h"]  # logarithm of the unnormalized probability among the explanations of the same mode
     best: int
 
     @staticmethod
@@ -56,19 +55,19 @@ class Posterior:
         terms: Quadratic,
         landmarks: Landmarks,
         scatter: Float[Tensor, "4"],
-        systematic: Float[Tensor, "g P P"] | float = 0.0,
+        systematic: Float[Tensor, "h P P"] | float = 0.0,
         log_odds: Float[Tensor, "g"] | float = 0.0,
-        log_weights: Float[Tensor, "h"] | None = None,
+        weights: Float[Tensor, "h"] | None = None,
         device: torch.device = torch.device("cpu"),  # noqa: B008
     ) -> Posterior:
         """Compare explanations within a mode by their cost, and modes by the evidence of landmarks and their prior ``log_odds``.
 
         ``terms`` are the quadratic models of all terms, and ``states`` and ``normal`` their minima under each explanation. ``systematic``
-        is the scatter of the models' gradients (in the units of ``terms``) beyond that of independent errors. ``log_weights`` replace the
-        evidence for explanations of a mode, if given. Most of the computation runs on ``device``.
+        is the scatter of the gradients of each state (in the units of ``terms``) beyond that of independent errors. ``weights`` are the
+        log evidence for each explanation, by default that of all terms. Most of the computation runs on ``device``.
         """
         by_mode, information = run_on(device, _information, states, normal, terms, landmarks, systematic)
-        weights = log_evidence(states, normal) if log_weights is None else log_weights
+        weights = log_evidence(states, normal) if weights is None else weights
         member = states.mode[None] == torch.arange(len(terms.here))[:, None]
         norm = torch.where(member, weights[None], -torch.inf).logsumexp(-1)
         # The log odds between places do not grow in proportion to the number of matches, since the right place rarely has fewer than
@@ -80,7 +79,7 @@ class Posterior:
         best = int(probability.argmax())
         states, covariance = _true_cameras(states, normal, _robust_covariance(*information), scatter)
         anchor = states.T[best]
-        return Posterior(states, normal, probability, covariance, (anchor.inverse() @ states.T).log(), weights, best)
+        return Posterior(states, normal, probability, covariance, (anchor.inverse() @ states.T).log(), best)
 
     @property
     def mode(self) -> int:
@@ -170,8 +169,8 @@ def _information(
     """Return the landmark evidence for each mode, and the arguments of ``_robust_covariance``."""
     unit, scale, g = terms.here.unit, 1 / states.unit, states.mode
     parts = [unit[:, :, None] * part * unit[:, None] for part in landmarks.sandwich(terms.here)]
-    parts = [parts[0], parts[1], parts[2] + systematic]
-    hessian, curvature, scatter = (scale[:, :, None] * part[g] * scale[:, None] for part in parts)
+    parts = [parts[0][g], parts[1][g], parts[2][g] + systematic]
+    hessian, curvature, scatter = (scale[:, :, None] * part * scale[:, None] for part in parts)
     rest = normal.hessian - hessian * (landmarks.share * landmarks.correlation)[g][:, None, None]
     unit = (hessian + rest).diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
     hessian, curvature, scatter = (
@@ -282,25 +281,37 @@ def linearize_modes(best: States, terms: Sequence[CostTerm], given: Explanations
 def settle(best: States, term: Landmarks, given: Explanations) -> tuple[States, Minima, States]:
     """Fit the landmarks with newly estimated noise; return the results of ``fit``, and then the most probable state of each mode."""
     best, (quadratic, states, normal) = fit_modes(term.with_noise(best), [term], given, 4)
+    weights = log_evidence(states, normal)
+    return best, (quadratic, states, normal), states[_most_probable(best, states, weights)]
+
+
+def _most_probable(best: States, states: States, weights: Float[Tensor, "h"]) -> Int[Tensor, "g"]:
+    """Return the numbers of the most probable of the ``states`` of each mode."""
     member = states.mode[None] == best.mode[:, None]
-    log = torch.where(member, log_evidence(states, normal)[None], -torch.inf)
-    return best, (quadratic, states, normal), states[log.argmax(-1)]
+    return torch.where(member, weights[None], -torch.inf).argmax(-1)
 
 
 def fit_with_rays(
     best: States, terms: Sequence[CostTerm], rays: RenderedRays, given: Explanations, which: Int[Tensor, "r"]
-) -> tuple[Minima, Float[Tensor, "g P P"]]:
-    """Refine the states ``which`` with rays; return the minima, and the Hessians of the rays alone, 0 for the other states.
+) -> tuple[Minima, States, Float[Tensor, "h"], Float[Tensor, "g P P"], Float[Tensor, "g"]]:
+    """Refine the states ``which`` with rays, which are too expensive to be rendered for all explanations.
 
-    Rays are too expensive to be rendered for all explanations.
+    Returns the minima, the most probable state of each mode, the log evidence for each explanation, the Hessians of the rays alone
+    (0 for the other states), and the mean losses of the rays, divided by the square of their scale (NaN for the other states).
     """
     rays = rays.fitted(best[which])
     here, _ = descend(best[which], [*terms, rays], 4)
     quadratic = linearize_modes(best.with_rows(which, here), terms, given)
-    by_rays = Quadratic.of(rays(quadratic.here[which]), quadratic.here[which])
-    quadratic = quadratic.with_rows_added(which, by_rays)
+    compared = rays.at(move_to(quadratic.here[which], rays.rgb.device))
+    by_rays = Quadratic.of(move_to(compared.normal(), best.z.device), quadratic.here[which])
+    plain, quadratic = quadratic, quadratic.with_rows_added(which, by_rays)
+    states, normal = quadratic.minimum(given.about(quadratic.here))
+    # The cost of rays has small local minima, so that few of its differences between cameras are evidence.
+    weights = log_evidence(states, normal)
+    weights = weights + (1 - 1 / KEYPOINTS_PER_INDEPENDENT) * (quadratic(states).cost - plain(states).cost)
     hessian = torch.zeros_like(quadratic.hessian).index_add(0, which, by_rays.hessian)
-    return (quadratic, *quadratic.minimum(given.about(quadratic.here))), hessian
+    loss = torch.full_like(quadratic.cost, torch.nan).index_copy(0, which, compared.loss().to(best.z))
+    return (quadratic, states, normal), states[_most_probable(best, states, weights)], weights, hessian, loss
 
 
 def cost_of(points: Surface, states: States) -> Float[Tensor, "h"]:

@@ -50,13 +50,6 @@ class Thumbnail:
         rgb, T = smooth(rgb[0]), view.T_ref_camera.to("cpu", torch.float64)
         return Thumbnail(small, T, rgb, flat.reshape(-1, 3), slopes(rgb, small))
 
-    @property
-    def mirrored(self) -> Thumbnail:
-        """The mirror image, left and right swapped."""
-        camera, rgb = replace(self.camera, cx=self.camera.width - self.camera.cx), self.rgb.flip(-1)
-        flat = camera.unproject(camera.pixel_centres()).to(self.flat).reshape(-1, 3)
-        return Thumbnail(camera, self.T_last_camera, rgb, flat, slopes(rgb, camera))
-
 
 def smooth(image: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
     """Convolve an image with a 5x5 binomial kernel, approximately a Gaussian of one pixel; the border is replicated."""
@@ -215,31 +208,22 @@ def render_view(renderer: Renderer, small: Thumbnail, T: SE3) -> tuple[Tensor, T
     return rgb.flatten(2), known.flatten(1), points, along / torch.linalg.vector_norm(small.flat, dim=-1)
 
 
-def small_images(
-    problem: Problem, width: int, camera: Float[Tensor, "6"] | None = None, mirrored: bool = False
-) -> Images:
-    """Return the term that compares images of at most ``width`` pixels, or their mirror images, with renderings of the field.
-
-    ``camera`` is the correction of the stated camera (see ``NUISANCES``), if there is one.
-    """
-    views = problem.views
-    if camera is not None and not mirrored:
-        changed = (v.frame.replace(intrinsics=true_intrinsics(v.frame.intrinsics, camera)) for v in views)
-        views = tuple(replace(view, frame=frame) for view, frame in zip(views, changed, strict=True))
-    thumbnails = [Thumbnail.of(view, width) for view in views]
-    thumbnails = [move_to(each.mirrored if mirrored else each, problem.device) for each in thumbnails]
-    return Images(field_renderer(problem.field, problem.bounds), thumbnails)
-
-
-def refine_on_small_images(problem: Problem, state: States, blur: float, mirrored: bool = False) -> States:
+def refine_on_small_images(problem: Problem, state: States, blur: float) -> States:
     """Refine a state on small renderings of the field, from coarse to fine, if it is off by more than rays can mend.
 
     ``blur`` is the uncertainty of the projection of the scene, pixels. Widths are such that it is about one pixel at first. The
     camera is held.
     """
-    frames = [view.frame.intrinsics for view in problem.views]
-    width = max(32.0, max(max(camera.width, camera.height) for camera in frames) / blur)
+    frames = [view.frame for view in problem.views]
+    cameras = [true_intrinsics(frame.intrinsics, state.nuisances[0, CAMERA]) for frame in frames]
+    views = [
+        replace(view, frame=frame.replace(intrinsics=camera))
+        for view, frame, camera in zip(problem.views, frames, cameras, strict=True)
+    ]
+    renderer = field_renderer(problem.field, problem.bounds)
+    width = max(32.0, max(max(camera.width, camera.height) for camera in cameras) / blur)
     while width <= 128:
-        state, _ = descend(state, [small_images(problem, round(width), state.nuisances[0, CAMERA], mirrored)], 5)
+        thumbnails = [move_to(Thumbnail.of(view, round(width)), problem.device) for view in views]
+        state, _ = descend(state, [Images(renderer, thumbnails)], 5)
         width *= 2
     return state

@@ -17,7 +17,7 @@ from bidnerf_core.frames import Frame, View, inpaint
 from bidnerf_core.geometry import Robust
 from bidnerf_core.localization.terms.exposure import eliminate, fit_exposure
 from bidnerf_core.localization.terms.rendering import channels, differentiate
-from bidnerf_core.localization.terms.surface import sights_of
+from bidnerf_core.localization.terms.surface import draw, sights_of
 from bidnerf_core.mapping import MOTION, Normal, Sights, States, rays_by_camera, rays_through
 
 ALONE = 10.0
@@ -60,20 +60,31 @@ class RenderedRays:
         blur: int = 1,
         depth_rays: Observations | None = None,
         device: torch.device | str | None = None,
+        steep: bool = False,
     ) -> RenderedRays:
         """Draw ``count`` visible pixels of ``views``, and at most as many of ``depth_rays``.
 
         The poses of ``views`` are relative to the last view; another sensor measured ``depth_rays`` in the last camera's frame.
-        Colours are averaged over squares of ``blur`` pixels. The tensors are put on ``device``, by default the field's.
+        Colours are averaged over squares of ``blur`` pixels. If ``steep``, pixels where the image changes are preferred, since
+        the others hardly depend on the pose. The tensors are put on ``device``, by default the field's.
         """
         generator, parts = torch.Generator().manual_seed(seed), []
         for view in views:
-            frame, camera = view.frame, view.frame.intrinsics
-            number = torch.randperm(camera.width * camera.height, generator=generator)
-            if frame.hidden is not None:
-                number = number[~frame.hidden.cpu().flatten()[number]]
-            number = number[: -(-count // len(views))]
+            frame, camera, most = view.frame, view.frame.intrinsics, -(-count // len(views))
+            hidden = None if frame.hidden is None else frame.hidden.cpu().flatten()
+            number = draw(camera.width * camera.height, (16 if steep else 1) * most, generator, hidden)
             column, row = number % camera.width, number // camera.width
+            if steep and len(number) > most:
+                step = max(1, camera.width // 400)
+                neighbours = (
+                    frame.colours_at((row + v).clamp(0, camera.height - 1), (column + u).clamp(0, camera.width - 1))
+                    for u, v in ((step, 0), (-step, 0), (0, step), (0, -step))
+                )
+                own = frame.colours_at(row, column)
+                change = torch.stack([colour - own for colour in neighbours]).square().sum((0, 2)).sqrt().cpu()
+                # Half of the rays are drawn evenly, since a rendering may change where the image does not.
+                chosen = torch.multinomial(change + change.mean().clamp(min=1e-6), most, generator=generator)
+                column, row = column[chosen], row[chosen]
             sights = sights_of(view, row, column, len(views) == 1)
             depth = torch.zeros(len(row)) if frame.depth is None else frame.depth.cpu()[row, column]
             length = pad(sights[0], (0, 1), value=1.0).norm(dim=-1)
@@ -106,6 +117,11 @@ class RenderedRays:
     def __len__(self) -> int:
         return len(self.rgb)
 
+    def first(self, count: int) -> RenderedRays:
+        """Return the term of the first ``count`` rays, which are a random sample of those of a single image."""
+        some = slice(0, count)
+        return replace(self, **{name: getattr(self, name)[some] for name in ("sights", "rgb", "coloured", "distance")})
+
     def __call__(self, states: States) -> Normal:
         return move_to(self.at(move_to(states, self.rgb.device)).normal(), states.z.device)
 
@@ -123,6 +139,10 @@ class RenderedRays:
         """Return each ray's robust loss, divided by the variance of the noise, without derivatives."""
         found = self.at(move_to(states, self.rgb.device), derivatives=False)
         return (self._robust(found.value)[0] / self.noise**2).to(states.z.device)
+
+    def loss_at(self, states: States) -> Float[Tensor, "h"]:
+        """Return the mean robust loss of a ray, in squares of the loss's scale, without derivatives."""
+        return self.at(move_to(states, self.rgb.device), derivatives=False).loss().to(states.z)
 
     def agreement(self, states: States) -> Float[Tensor, "h"]:
         """Return the fraction of the rays whose colours and distances agree with the rendering."""
@@ -268,6 +288,10 @@ class ComparedRays:
         hessian = (flat * weight.flatten(1)[..., None]).mT @ flat
         share = term.independent / (len(term) + term.independent) / term.noise**2
         return Normal(share * cost.sum(-1), share * (flat * pull[..., None]).sum(1), share * hessian)
+
+    def loss(self) -> Float[Tensor, "h"]:
+        """Return the mean robust loss of a ray, in squares of the loss's scale."""
+        return self.term._robust(self.value)[0].mean(-1) / self.term.loss.scale**2
 
     def agreement(self) -> Float[Tensor, "h"]:
         """Return the fraction of the rays whose colours and distances agree with the rendering."""

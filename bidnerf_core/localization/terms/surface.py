@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bidnerf_core.camera import exposure_times
@@ -30,6 +30,18 @@ from bidnerf_core.mapping import (
 
 COLOUR = 0.15
 """Norm of the colour difference (three channels, each in [0, 1]) at which a point's inlier weight is one half."""
+
+
+def draw(
+    size: int, count: int, generator: torch.Generator, left_out: Bool[Tensor, "n"] | None = None
+) -> Int[Tensor, "c"]:
+    """Return about ``count`` of ``size`` numbers, or all if there are fewer, without those ``left_out``."""
+    # Drawing with replacement takes far less time, and hardly any of so many numbers is drawn twice.
+    if size > 100 * count:
+        some = torch.randint(size, (count if left_out is None else 2 * count,), generator=generator)
+    else:
+        some = torch.randperm(size, generator=generator)
+    return (some if left_out is None else some[~left_out[some]])[:count]
 
 
 def sights_of(view: View, row: Tensor, column: Tensor, may_move: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -79,12 +91,7 @@ class Surface:
             frame = view.frame
             depth = torch.zeros((0, 0)) if frame.depth is None else frame.depth.cpu()
             row, column = ((depth > 0) & depth.isfinite()).nonzero().unbind(-1)
-            most = -(-count // len(views))
-            # Drawing with replacement takes far less time, and hardly any of so many points is drawn twice.
-            if len(row) > 20 * most:
-                drawn = torch.randint(len(row), (most,), generator=generator)
-            else:
-                drawn = torch.randperm(len(row), generator=generator)[:most]
+            drawn = draw(len(row), -(-count // len(views)), generator)
             row, column = row[drawn], column[drawn]
             sights = sights_of(view, row, column, len(views) == 1)
             z, n = depth[row, column].double(), len(row)

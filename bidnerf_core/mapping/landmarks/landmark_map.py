@@ -39,7 +39,7 @@ class HeldOutTrial:
     # They are unknown for points in a map without measured depth, whose surface has the errors of the field's depth.
     points: float = 10.0
     rays: float = 3.0
-    difference: float = 0.0  # usual difference between a small image and its rendering, see ``Images``; 0 if unknown
+    difference: float = 0.0  # usual mean loss of rays at a right pose, in squares of the loss's scale; 0 if unknown
 
     def scaled(self, factor: float) -> HeldOutTrial:
         """Return the trial in a map with lengths multiplied by ``factor``."""

@@ -134,6 +134,11 @@ class Sights:
         rotation, translation = self.rotation[index], self.translation[index]
         return Sights(self.image[index], self.times[index], rotation, translation, self.single)
 
+    @property
+    def mirrored(self) -> Sights:
+        """The sights in the mirror image of a single image, left and right swapped."""
+        return replace(self, image=self.image * constant((-1.0, 1.0), self.image))
+
 
 @dataclass(frozen=True, eq=False)
 class Projections:
