@@ -145,6 +145,8 @@ def features(found: Evidence) -> dict[str, float]:
         # Without measured points, the surface neither supports nor contradicts a pose.
         "on_surface": 0.0 if found.on_surface is None else found.on_surface - 0.5,
         "colour_inliers": 0.0 if found.colour_inliers is None else found.colour_inliers - 0.25,
+        # Without rendered rays, they neither support nor contradict a pose.
+        "difference": 0.0 if found.difference is None else math.log10(max(found.difference, 0.5)),
     }
 
 

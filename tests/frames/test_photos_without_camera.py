@@ -101,7 +101,6 @@ def test_a_portrait_photo_in_a_map_of_landscape_ones_has_their_camera() -> None:
     frame = Frame("portrait", rgb, camera, focal_is_approximate=True)
     found = Localizer(replace(textured_map(surface=True), landmarks=landmarks_of(GROUND_CAMERA)))(frame)
     assert found.converged
-    # Rays do not decide between the map's camera and one whose focal length is estimated.
     assert require(found.intrinsics).fx == pytest.approx(GROUND_CAMERA.fx, rel=0.03)
     turn = SE3.exp(torch.tensor([0, 0, 0, 0, 0, math.pi / 2], dtype=torch.float64))
     error = pose_error(found.T_world_camera, unseen().T_ref_camera @ turn)

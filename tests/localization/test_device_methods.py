@@ -81,7 +81,7 @@ def test_auto_by_colour(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "newly drawn rays" in here.reason
 
 
-@pytest.mark.parametrize(("depth", "most"), [(False, 80), (True, 70)])
+@pytest.mark.parametrize(("depth", "most"), [(False, 56), (True, 55)])
 def test_auto_by_landmarks_for_which_the_host_waits_a_handful_of_times(depth: bool, most: int) -> None:
     """It uploads and reads once for the matches, for each round of matching, each measurement and each step on small images."""
     frame, config = unseen().frame if depth else without_depth(unseen().frame), AutoConfig(**SETTINGS)

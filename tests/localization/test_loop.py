@@ -274,11 +274,11 @@ GROUND: dict[str, tuple[Any, Expected]] = {
     ),
     "focal 1.02, rendered": (
         lambda: {"views": stated(unseen(), 1.02), "config": SHARP},
-        Right(camera=None, metres=0.025),  # small renderings hold the camera, which trades focal length for distance
+        MAP._replace(metres=0.02),
     ),
     "another camera 0.97, rendered": (
         lambda: {"views": other_camera(0.97), "config": SHARP},
-        Right(camera=None, metres=0.025, degrees=0.2),
+        Right(metres=0.02),
     ),
 }
 
