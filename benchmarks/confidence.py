@@ -70,7 +70,8 @@ def example(key: Sequence[str], row: dict[str, Any]) -> Example:
     scene, _, condition, _ = key
     error = row["translation"]
     right = error is not None and error < 0.05 and row["rotation_deg"] < 5
-    return Example(features(Evidence(**row["evidence"])), right, scene, condition)
+    # Maps from halves of a scene's images are of one scene.
+    return Example(features(Evidence(**row["evidence"])), right, scene.partition("@")[0], condition)
 
 
 def fit_model(given: Sequence[Example], ridge: float = RIDGE) -> LogisticModel:
