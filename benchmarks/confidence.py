@@ -37,7 +37,7 @@ STORED = Path(bidnerf_core.__file__).parent / "localization" / "acceptance.json"
 RIDGE = 0.005
 """Penalty of the squared weights of standardised features, relative to the mean log loss."""
 GOOD = ("inliers", "above_chance", "recall", "spread", "mass", "on_surface", "colour_inliers")
-BAD = ("noise_ratio", "precision", "replaced", "difference")
+BAD = ("noise_ratio", "precision", "replaced")
 """Features whose larger values can only raise (GOOD) or only lower (BAD) the confidence: examples are too few to show each."""
 BINS = 10
 WITHOUT_CONFIDENCE = (Outcome.MIRRORED, Outcome.AMBIGUOUS)
