@@ -32,6 +32,7 @@ from bidnerf_core.localization import (
     Images,
     Problem,
     RayTerms,
+    RenderedRays,
     rig,
     states_at,
 )
@@ -170,6 +171,27 @@ def test_an_image_of_other_exposure_costs_the_same_once_it_is_eliminated() -> No
     assert float(plain(truth).cost) < 0.02 * float(plain(near()).cost.min())
     fixed = replace(other, exposure=False)
     assert float(fixed(truth).cost) > 10 * float(other(truth).cost)
+
+
+def test_steep_rays_are_drawn_where_the_image_changes_and_cost_least_at_the_truth() -> None:
+    view = observed(BLOBS)
+    given, truth = problem(BLOBS, view), states_at(T0[None])
+    even, steep = (RenderedRays.of(given.views, BLOBS, BOUNDS, 60, 0, steep=steep) for steep in (False, True))
+    # Fewer of them have the most frequent colour, that of the background.
+    background = view.frame.rgb.flatten(0, 1).mode(0).values.double()
+    plain = [float((rays.rgb - background).norm(dim=-1).lt(0.02).double().mean()) for rays in (even, steep)]
+    assert plain[1] < 0.7 * plain[0]
+    assert float(steep.loss_at(truth)) < 0.1 * float(steep.loss_at(near()).min())
+    # The first rays are a sample of all.
+    assert torch.equal(steep.first(20).rgb, steep.rgb[:20])
+
+
+def test_the_rays_of_a_mirror_image_agree_if_their_sights_are_mirrored() -> None:
+    view = observed(BLOBS)
+    flipped = replace(view, frame=replace(view.frame, rgb=view.frame.rgb.flip(1).contiguous()))
+    rays = RenderedRays.of(problem(BLOBS, flipped).views, BLOBS, BOUNDS, 200, 0)
+    truth = states_at(T0[None])
+    assert float(replace(rays, sights=rays.sights.mirrored).loss_at(truth)) < 0.1 * float(rays.loss_at(truth))
 
 
 def test_gain_and_offset_are_found_beside_outliers_and_have_no_derivative_left(
