@@ -231,5 +231,5 @@ def test_training_refuses_contradicting_poses_unless_they_are_trusted() -> None:
     with refused(found="the poses contradict the photos") as caught:
         prepare_views(wrong, features="points")
     assert "if they are inverses" in caught.error.found
-    assert "--trust-poses" in caught.error.found
+    assert "trust_poses" in caught.error.found
     assert prepare_views(wrong, "never", features="points", trust_poses=True).cameras
