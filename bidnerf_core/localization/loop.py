@@ -60,16 +60,7 @@ from bidnerf_core.localization.result import Outcome, Verdict, current_record
 from bidnerf_core.localization.terms.images import Images, refine_on_small_images
 from bidnerf_core.localization.terms.rays import RenderedRays
 from bidnerf_core.localization.terms.surface import Surface
-from bidnerf_core.mapping import (
-    CostTerm,
-    Features,
-    LandmarkMap,
-    Landmarks,
-    Sights,
-    States,
-    point_variance,
-    project,
-)
+from bidnerf_core.mapping import CostTerm, Features, LandmarkMap, Landmarks, Sights, States, point_variance, project
 
 MIRROR = "mirror image"
 """Name of the mode of an image whose mirror image fits."""
@@ -436,11 +427,6 @@ class Loop:
             fused.append("rendering")
         return replace(answer, fused=tuple(fused))
 
-    def _log10_nfa(self, mode: Mode, state: States) -> float:
-        """Return log10 of the number of false alarms of the matches by descriptors that agree with a state of a mode."""
-        agreeing = int(inliers(mode.query, self.landmarks, mode.by_descriptors, state).sum())
-        return log10_nfa(len(mode.by_descriptors), agreeing, mode.query.by_chance)
-
     def _posterior(
         self,
         minima: Minima,
@@ -488,8 +474,9 @@ class Loop:
         places = SE3.stack([found.place(g) for g in range(len(modes))])
         same = same_pose(state.T[0], places, middle) & torch.tensor([mode.name != MIRROR for mode in modes])
         same = (found.states.mode == found.mode) | same[found.states.mode]
+        agreeing = int(inliers(query, self.landmarks, mode.by_descriptors, state).sum())
         evidence = Evidence(
-            log10_nfa=self._log10_nfa(mode, state) if searched else 0.0,
+            log10_nfa=log10_nfa(len(mode.by_descriptors), agreeing, query.by_chance) if searched else 0.0,
             inliers=count,
             by_chance=chance,
             recall=count / max(1, min(seen.visible, len(query.view))),

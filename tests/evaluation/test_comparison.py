@@ -243,7 +243,7 @@ def test_the_command_prints_a_table_and_writes_what_it_says(
         (["{map}", "{data}", "--frame", "r_77"], 1, "r_77"),
         (["{map}", "{data}", "--protocol", "bib"], 2, "did you mean 'bid'"),
         (["{data}", "{data}"], 1, "expected a map"),
-        (["{map}", "{map}", "{data}"], 1, "two maps are named"),
+        (["{map}", "{map}", "{data}"], 2, "two maps are named"),
     ],
 )
 def test_mistakes_are_told_before_the_work_begins(

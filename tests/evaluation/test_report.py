@@ -337,7 +337,7 @@ def hostile_result(place: int) -> TrialResult:
     """Return a result that holds every second hostile text wherever a file may hold any text."""
     texts, usual = HOSTILE[place::2], result(place, 2 + place, protocol="none")
     text, name = "".join(texts), "".join(texts).replace("\0", "")
-    images = DatasetOptions(name, text, masks=name)
+    images = DatasetOptions(camera=name, split=text, masks=name)
     trial = dataclasses.replace(usual.trial, map=name, data=name, images=images, device=text)
     return dataclasses.replace(
         usual, settings={each: each for each in texts}, backend=text, weights=text, reason=text, trial=trial

@@ -110,12 +110,18 @@ def test_a_portrait_photo_in_a_map_of_landscape_ones_has_their_camera() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("factor", "has_landmarks"), [(0.7, True), (1.0, False), (1.15, False)])
-def test_colours_alone_do_not_tell_an_approximate_focal_length(photo: Path, factor: float, has_landmarks: bool) -> None:
-    """Neither landmarks of unknown cameras nor colours: the ground looks nearly flat."""
+def test_colours_tell_an_approximate_focal_length_only_with_landmarks(
+    photo: Path, factor: float, has_landmarks: bool
+) -> None:
+    """The ground looks nearly flat."""
     wrong = replace(GROUND_CAMERA, fx=GROUND_CAMERA.fx * factor, fy=GROUND_CAMERA.fy * factor)
     frame = Frame.read(photo, CameraSource(assumed=(wrong,)))
     known = landmarks_of() if has_landmarks else None
-    assert not Localizer(replace(textured_map(surface=True), landmarks=known))(frame).converged
+    found = Localizer(replace(textured_map(surface=True), landmarks=known))(frame)
+    assert found.converged == has_landmarks, found.reason
+    if has_landmarks:
+        assert found.focal_factor == pytest.approx(1 / factor, rel=0.01)
+        assert pose_error(found.T_world_camera, unseen().T_ref_camera).translation < 0.01
 
 
 def test_nor_do_those_of_a_blurred_photo() -> None:

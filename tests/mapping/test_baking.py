@@ -199,7 +199,7 @@ def test_memory_is_bounded_and_a_warning_says_so(generator: Generator, monkeypat
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         free = choose_grid(points, baked.BOUNDS, 0.03, 0.03, 200.0)
-    with pytest.warns(InputWarning, match=r"MB with cells of 0\.03; cells of .* within 0\.2 MB.*--megabytes"):
+    with pytest.warns(InputWarning, match=r"MB with cells of 0\.03; cells of .* within 0\.2 MB.*`megabytes`"):
         bounded = choose_grid(points, baked.BOUNDS, 0.03, 0.03, 0.2)
     assert surface_bytes(points, bounded) <= 0.2e6 < surface_bytes(points, free)
     assert bounded.cell < 0.18  # no coarser than needed

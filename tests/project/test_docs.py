@@ -197,7 +197,8 @@ def test_blocks_are_of_known_languages_and_those_that_are_not_run_exist() -> Non
 @pytest.mark.usefixtures("quick_auto")
 def test_bidnerf_commands_work(page: Path, inside: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Commands that are quick are run on tiny files; the others are parsed."""
-    for program, *arguments in commands(page):
+    for program, *words in commands(page):
+        arguments = ["hashgrid" if word == "mine" else word for word in words]  # instead of the reader's own backend
         if program == "bidnerf":
             with monkeypatch.context() as patch:
                 if arguments[0] in TOO_SLOW:

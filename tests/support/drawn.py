@@ -75,9 +75,12 @@ def dataset_options() -> SearchStrategy[DatasetOptions]:
     """Options of which JSON can hold every value."""
     text = st.none() | words
     units = st.none() | st.floats(1e-6, 1e-2)
-    masked = st.builds(DatasetOptions, text, words, text, units, words, st.sampled_from(["black", "white"]))
+    shared = {"camera": text, "images": text, "split": words, "depth_unit": units}
+    masked = st.builds(
+        DatasetOptions, **shared, register_depth=text, masks=words, mask_hides=st.sampled_from(["black", "white"])
+    )
     return masked | st.builds(
-        DatasetOptions, text, words, text | st.booleans(), units, largest=st.none() | st.integers(1, 9)
+        DatasetOptions, **shared, register_depth=text | st.booleans(), largest=st.none() | st.integers(1, 9)
     )
 
 

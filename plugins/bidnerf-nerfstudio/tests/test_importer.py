@@ -77,7 +77,7 @@ def test_what_was_found_is_told(run_of: RunOf) -> None:
     told = " ".join(found.found)
     assert "NerfactoModel of nerfstudio, 400 steps (step-000000399.ckpt)" in told
     assert "room/transforms_train.json is no longer there" in told
-    assert "--photos" in told
+    assert "`photos`" in told
     assert found.photos is None
 
 
@@ -225,7 +225,7 @@ def test_damaged_configs(run_of: RunOf) -> None:
 
 
 def test_a_dataset_that_was_moved(run_of: RunOf, tmp_path: Path) -> None:
-    assert "--data" in refusal(run_of("nerfacto"), data=str(tmp_path / "none"))
+    assert "`data`" in refusal(run_of("nerfacto"), data=str(tmp_path / "none"))
     with pytest.raises(InputError, match="background"):
         ImportSettings(background="red")  # type: ignore[arg-type]
     assert read(tmp_path / "nerfacto", background="white").bounds.background == (1.0, 1.0, 1.0)

@@ -12,7 +12,6 @@ import torch
 
 from bidnerf import SE3, Frame, InputError, Intrinsics, Localization, Outcome
 from bidnerf_ros2.corrector import Corrector
-from refusals import refused
 
 CAMERA = Intrinsics(width=4, height=3, fx=4.0, fy=4.0, cx=2.0, cy=1.5)
 FRAME = Frame("a", torch.zeros((3, 4, 3)), CAMERA)
@@ -108,7 +107,7 @@ def test_an_error_reaches_the_caller_once_and_the_next_frame_is_localized(
     assert mine.give(FRAME, T_ODOM_CAMERA)
     localizer.go_on.release(2)
     until(lambda: mine.T_world_odom is not None)
-    with refused(where="a", found="no light"):
+    with pytest.raises(InputError, match="a: no light"):
         mine.give(FRAME, T_ODOM_CAMERA)
     mine.close()
 
@@ -125,7 +124,7 @@ def test_closing_waits_for_the_work_drops_what_waits_and_raises_an_error(
         mine.close()
     assert len(localizer.answers) == 1  # the frame that waited was not localized
     mine.close()  # again: nothing is left to say
-    with refused(found="the corrector is closed"):
+    with pytest.raises(InputError, match="the corrector is closed"):
         mine.give(FRAME, T_ODOM_CAMERA)
 
 

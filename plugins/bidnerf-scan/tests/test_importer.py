@@ -90,7 +90,7 @@ def test_up_is_that_of_the_format_or_as_said(tmp_path: Path) -> None:
 
 def test_coordinates_of_a_survey_are_moved_to_the_origin() -> None:
     far = np.random.default_rng(0).normal(size=(300, 3)) + np.array([500_000, 4_200_000, 100])
-    with pytest.raises(InputError, match="--origin 500000 4200000 100"):
+    with pytest.raises(InputError, match="`origin` 500000 4200000 100"):
         imported(Scan(far), "x")
     found = imported(Scan(far), "x", ScanSettings(origin=(500_000, 4_200_000, 100)))
     assert max(map(abs, (*found.bounds.lower, *found.bounds.upper))) < 10
