@@ -14,7 +14,6 @@ from bidnerf_core.localization import (
     ACCEPTED,
     CAMERAS,
     DISPLACEMENT,
-    LANDMARK_BOUNDS,
     MIRROR,
     MOVING,
     Evidence,
@@ -259,7 +258,7 @@ def acceptance_figures(localization: Localization, record: SearchRecord | None) 
 
 
 def _landmark_figures(evidence: Evidence) -> Iterator[EvidenceFigure]:
-    bounds = {bound.measure: bound for bound in LANDMARK_BOUNDS}
+    bounds = {bound.measure: bound for bound, _ in evidence.bounds}
     for measure, text in MEASURES.items():
         value, bound = getattr(evidence, measure), bounds.get(measure)
         if value is None or (measure == "log10_nfa" and not evidence.searched):
