@@ -106,8 +106,8 @@ LANDMARK_BOUNDS = (
         "the image contradicts the intrinsics: they are right with {0:.0%}",
     ),
     Bound("precision", 0.03, False, Outcome.IMPRECISE, "the position is uncertain by {0:.1%} of the distance", True),
-    # On record (``answers_halves``: four maps of each of six scenes, with and without faults), 494 answers are accepted, 15 of which are
-    # wrong, and 70 of 71 right ones to unchanged images; at a bound of 3, some 50 more, half of them wrong.
+    # On record (``answers_halves``: four maps of each of six scenes, with and without faults), 487 answers are accepted, 14 of which are
+    # wrong, and nearly all right ones to unchanged images; at a bound of 3, 59 more, 26 of which are wrong.
     Bound(
         "difference",
         1.6,
