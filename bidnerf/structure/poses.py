@@ -50,9 +50,9 @@ from bidnerf.structure.sources import (
     Frames,
     SourceImage,
     choose_frames,
-    frames_of,
     measure_frames,
     photos_of,
+    recorded_frames,
     refuse_panoramas,
     write_frames,
 )
@@ -93,7 +93,7 @@ def find_poses(
     """
     source, folder = Path(photos), Path(out)
     pycolmap = import_pycolmap(str(source))
-    frames = frames_of(source, camera) if source.exists() else None
+    frames = recorded_frames(source, camera) if source.exists() else None
     images = photos_of(source, folder, camera) if frames is None else []
     inputs = digest([image.file for image in images] or [source], camera)
     if reuse or not overwrite:

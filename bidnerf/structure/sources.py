@@ -82,7 +82,7 @@ class SourceImage:
     depth_unit: float | None = None  # metres per step of the depth image, if it is an image of steps
 
 
-def frames_of(source: Path, camera: Camera | CameraSource | str | Path | None) -> Frames | None:
+def recorded_frames(source: Path, camera: Camera | CameraSource | str | Path | None) -> Frames | None:
     """Return the frames that have to be written as images: those of a video, or of a recording that is a single file."""
     if is_video(source):
         return Video(source)

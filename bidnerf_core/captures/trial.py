@@ -87,9 +87,8 @@ def tried_landmarks(
         lambda c: _student(updates, predicted_covariances(answers, matches, replace(landmarks, correlation=c))),
     )
     landmarks = replace(landmarks, correlation=max(correlation, 1.0))
-    if (
-        correlation < 1
-    ):  # errors are smaller than even independent keypoints explain, so the given poses are better than resection shows
+    # Errors may be smaller than even independent keypoints explain, if the given poses are better than resection shows.
+    if correlation < 1:
         errors = landmarks.pose_covariance
         share = _most_probable(
             EXCESS,

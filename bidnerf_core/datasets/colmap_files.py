@@ -32,7 +32,7 @@ from bidnerf_core.camera import MODELS, Camera, colmap_camera, read_text_cameras
 from bidnerf_core.depth import DepthImage, depth_image
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import is_file, open_arrays, read_file, read_lines, read_table
+from bidnerf_core.io import is_file, open_arrays, read_database_table, read_file, read_lines
 from bidnerf_core.mapping import FIRST_CENTRE, Keypoints, quantize
 
 MODEL_FILE = "a file of a COLMAP sparse model"
@@ -270,12 +270,14 @@ _Stored: TypeAlias = Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]
 def _of_database(path: Path, names: Iterable[str]) -> _Stored:
     expected, columns, known = "a database of COLMAP", ("image_id", "rows", "cols", "data"), set(names)
     by_number = {
-        number: name for number, name in read_table(path, "images", ("image_id", "name"), expected) if name in known
+        number: name
+        for number, name in read_database_table(path, "images", ("image_id", "name"), expected)
+        if name in known
     }
     keypoints = {
-        number: row for number, *row in read_table(path, "keypoints", columns, expected) if number in by_number
+        number: row for number, *row in read_database_table(path, "keypoints", columns, expected) if number in by_number
     }
-    for number, *row in read_table(path, "descriptors", columns, expected):
+    for number, *row in read_database_table(path, "descriptors", columns, expected):
         if number in keypoints:
             try:
                 of_image, descriptors = (

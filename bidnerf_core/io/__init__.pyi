@@ -1,7 +1,7 @@
 from .allowance import Allowance as Allowance
 from .archives import Archive as Archive
 from .databases import open_arrays as open_arrays
-from .databases import read_table as read_table
+from .databases import read_database_table as read_database_table
 from .files import FileInUse as FileInUse
 from .files import PackedFile as PackedFile
 from .files import available_memory as available_memory

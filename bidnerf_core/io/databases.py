@@ -25,7 +25,7 @@ STEP = 10_000
 """Number of SQLite's instructions after which the total is checked. Reading a row takes about ten, and a row at least five bytes."""
 
 
-def read_table(path: Path, table: str, columns: Sequence[str], expected: str) -> Iterator[tuple[Any, ...]]:
+def read_database_table(path: Path, table: str, columns: Sequence[str], expected: str) -> Iterator[tuple[Any, ...]]:
     """Yield the rows of a table in a SQLite file, each with the values of ``columns``. Nothing is written beside the file.
 
     Raises ``InputError`` if the file is damaged or has no such table, for views and virtual tables, and if the rows take more

@@ -99,7 +99,7 @@ def open3d(camera: Intrinsics) -> dict[str, object]:
 
 
 def ost(camera: Intrinsics) -> str:
-    """As ROS's camera_calibration writes it."""
+    """Return the text that ROS's camera_calibration writes for a camera."""
     rows = "\n".join(" ".join(map(repr, matrix(camera)[i : i + 3])) for i in (0, 3, 6))
     lens = " ".join(map(repr, camera.distortion))
     identity = "1 0 0\n0 1 0\n0 0 1"

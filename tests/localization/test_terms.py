@@ -49,6 +49,7 @@ from bidnerf_core.localization.terms.images import (
 )
 from bidnerf_core.localization.terms.rays import averaged
 from bidnerf_core.localization.terms.rendering import differentiate
+from bidnerf_core.localization.terms.surface import draw_numbers
 from bidnerf_core.mapping import States, descend
 from problems import FieldMap
 from tiny import depth_rays_of
@@ -184,6 +185,14 @@ def test_steep_rays_are_drawn_where_the_image_changes_and_cost_least_at_the_trut
     assert float(steep.loss_at(truth)) < 0.1 * float(steep.loss_at(near()).min())
     # The first rays are a sample of all.
     assert torch.equal(steep.first(20).rgb, steep.rgb[:20])
+
+
+def test_as_many_rays_as_wanted_are_drawn_where_most_pixels_are_hidden(generator: torch.Generator) -> None:
+    hidden = torch.ones(100_000, dtype=torch.bool)
+    hidden[500:600] = False
+    drawn = draw_numbers(len(hidden), 50, generator, hidden)
+    assert len(drawn.unique()) == 50
+    assert not hidden[drawn].any()
 
 
 def test_the_rays_of_a_mirror_image_agree_if_their_sights_are_mirrored() -> None:

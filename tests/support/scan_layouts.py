@@ -489,7 +489,7 @@ def write_map_free(folder: Path, views: Sequence[View]) -> Path:
 
 
 def write_rtabmap(folder: Path, views: Sequence[View], of_robot: bool = False) -> Path:
-    """With the poses of a robot, whose camera is turned and moved on it."""
+    """Write an export of RTAB-Map; ``of_robot``: with poses of a robot, on which the camera is turned and moved."""
     T_robot_camera = np.eye(4)
     T_robot_camera[:3] = [[0, 0, 1, 0.1], [-1, 0, 0, 0.02], [0, -1, 0, 0.3]]
     rows, camera, (cx, cy) = ["#timestamp x y z qx qy qz qw id"], views[0].frame.intrinsics, centre(views[0])

@@ -17,7 +17,7 @@ from bidnerf_core.frames import Frame, View, inpaint
 from bidnerf_core.geometry import Robust
 from bidnerf_core.localization.terms.exposure import eliminate, fit_exposure
 from bidnerf_core.localization.terms.rendering import channels, differentiate
-from bidnerf_core.localization.terms.surface import draw, sights_of
+from bidnerf_core.localization.terms.surface import draw_numbers, sights_of
 from bidnerf_core.mapping import MOTION, Normal, Sights, States, rays_by_camera, rays_through
 
 ALONE = 10.0
@@ -72,7 +72,7 @@ class RenderedRays:
         for view in views:
             frame, camera, most = view.frame, view.frame.intrinsics, -(-count // len(views))
             hidden = None if frame.hidden is None else frame.hidden.cpu().flatten()
-            number = draw(camera.width * camera.height, (16 if steep else 1) * most, generator, hidden)
+            number = draw_numbers(camera.width * camera.height, (16 if steep else 1) * most, generator, hidden)
             column, row = number % camera.width, number // camera.width
             if steep and len(number) > most:
                 step = max(1, camera.width // 400)

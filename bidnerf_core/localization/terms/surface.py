@@ -32,16 +32,17 @@ COLOUR = 0.15
 """Norm of the colour difference (three channels, each in [0, 1]) at which a point's inlier weight is one half."""
 
 
-def draw(
+def draw_numbers(
     size: int, count: int, generator: torch.Generator, left_out: Bool[Tensor, "n"] | None = None
 ) -> Int[Tensor, "c"]:
-    """Return about ``count`` of ``size`` numbers, or all if there are fewer, without those ``left_out``."""
+    """Return ``count`` of ``size`` numbers, or all if there are fewer, without those ``left_out``, in random order."""
+    if left_out is not None:
+        others = (~left_out).nonzero()[:, 0]
+        return others[draw_numbers(len(others), count, generator)]
     # Drawing with replacement takes far less time, and hardly any of so many numbers is drawn twice.
     if size > 100 * count:
-        some = torch.randint(size, (count if left_out is None else 2 * count,), generator=generator)
-    else:
-        some = torch.randperm(size, generator=generator)
-    return (some if left_out is None else some[~left_out[some]])[:count]
+        return torch.randint(size, (count,), generator=generator)
+    return torch.randperm(size, generator=generator)[:count]
 
 
 def sights_of(view: View, row: Tensor, column: Tensor, may_move: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -91,7 +92,7 @@ class Surface:
             frame = view.frame
             depth = torch.zeros((0, 0)) if frame.depth is None else frame.depth.cpu()
             row, column = ((depth > 0) & depth.isfinite()).nonzero().unbind(-1)
-            drawn = draw(len(row), -(-count // len(views)), generator)
+            drawn = draw_numbers(len(row), -(-count // len(views)), generator)
             row, column = row[drawn], column[drawn]
             sights = sights_of(view, row, column, len(views) == 1)
             z, n = depth[row, column].double(), len(row)
