@@ -12,65 +12,60 @@ Principal points are as stored: the centre of the upper left pixel is at (0.5, 0
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from bidnerf.formats.scannet import read_matrix
-from bidnerf_core.datasets import Capture, DatasetOptions, DepthFile, Format, Shot, first_file, read_pose_matrix
-from bidnerf_core.depth import MILLIMETRE, DepthReader
+from bidnerf.formats.layouts import Layout
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets import Capture, DatasetOptions, Format, Shot, camera_of
+from bidnerf_core.depth import MILLIMETRE
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import photos_in
-from bidnerf_core.io import is_file, read_header
+from bidnerf_core.io import is_file, read_rows
 
+LAYOUT = Layout(
+    (("train/rgb", "val/rgb", "test/rgb"), ("rgb",)),
+    pose=("../poses/{name}.txt", "../pose/{name}.txt"),
+    camera=("../calibration/{name}.txt", "../intrinsics.txt"),
+    depth=("../depth/{name}.png", "../depth/{name}.depth.png"),
+)
 PREFIXES = {"0": "train", "1": "val", "2": "test"}
 
 
-def _read(path: Path, parts: list[tuple[Path, Path]], options: DatasetOptions) -> Capture:
+def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
     """Read the poses and calibrations. Raises ``InputError`` if one is invalid."""
-    unit, read, shots = options.depth_unit or MILLIMETRE, DepthReader(documented=("65535",)), list[Shot]()
-    for part, poses in parts:
-        files, calibrations = (
-            {file.name.partition(".")[0]: file for file in folder.glob("[!.]*.txt")}
-            for folder in (poses, part / "calibration")
-        )
-        of_all = first_file(part, "intrinsics.txt")
-        for image in photos_in(part / "rgb")[0]:
-            name = image.name.partition(".")[0]
-            calibration = calibrations.get(name, of_all)
-            if calibration is None:
-                raise InputError("has no calibration", where=image, expected=f"{part.name}/calibration/{name}.txt")
-            header, depth = read_header(image), first_file(part / "depth", f"{name}.png", f"{name}.depth.png")
-            pose = read_pose_matrix(files[name]) if name in files else None
-            split = part.name if part != path else PREFIXES.get(name.partition("_")[0]) if of_all else None
-            shots.append(
-                Shot(
-                    image=image,
-                    stem=name,
-                    camera=read_matrix(calibration, (header.width, header.height), first_centre=0),
-                    T_world_camera=pose,
-                    depth=None if depth is None else DepthFile(depth, partial(read, depth, unit)),
-                    splits=(split,) if split and pose is not None else (),
-                )
-            )
+    unit, has_digits, shots = options.depth_unit or MILLIMETRE, is_file(path / "intrinsics.txt"), list[Shot]()
+    for image, shot in zip(images, LAYOUT.shots(images, partial(read_matrix, first_centre=0), unit), strict=True):
+        digit, part = shot.stem.partition("_")[0] if has_digits else "", image.parents[1]
+        split = PREFIXES.get(digit) if part == path else part.name
+        shots.append(replace(shot, splits=(split,) if split and shot.T_world_camera else ()))
     expected = "a .txt file of 16 finite numbers for each image"
     return Capture(path, shots, options.colour, "metres", depth_unit=unit, poses_expected=expected)
 
 
-def _find(path: Path) -> list[tuple[Path, Path]]:
-    """Return the folders that have ``rgb``, with their folders of poses: those of the splits, or else the folder itself."""
-    found = list[tuple[Path, Path]]()
-    for part in (path / "train", path / "val", path / "test", path):
-        poses = next((folder for name in ("poses", "pose") if (folder := part / name).is_dir()), None)
-        has_calibration = (part / "calibration").is_dir() or is_file(part / "intrinsics.txt")
-        if poses is not None and (part / "rgb").is_dir() and has_calibration and not (part == path and found):
-            found.append((part, poses))
-    return found
+def read_matrix(file: Path, size: tuple[int, int], first_centre: float = 0.5) -> Intrinsics:
+    """Return the camera of a matrix, of a focal length, or of NSVF's focal length and principal point, for images of a ``size``.
+
+    ``first_centre`` is added to a principal point, see ``camera_of``. Raises ``InputError`` for a file with none of these.
+    """
+    expected = "a matrix of intrinsics, 3x3 or 4x4"
+    rows = [row.numbers() for row in read_rows(file, "intrinsics", expected)]
+    match rows:
+        case [[f]]:
+            numbers = f, f, size[0] / 2 - first_centre, size[1] / 2 - first_centre
+        case [[f, cx, cy, *_], *_] if cx:
+            numbers = f, f, cx, cy
+        case [[fx, _, cx, *_], [_, fy, cy, *_], [_, _, _, *_], *_]:
+            numbers = fx, fy, cx, cy
+        case _:
+            raise InputError(f"has {len(rows)} rows", where=file, expected=expected)
+    return camera_of(file, numbers, size, first_centre=first_centre)
 
 
 reader = Format(
     "ACE, DSAC* and Wayspots, and NSVF: one pose file an image, with splits, depth in millimetres",
     "train/rgb, train/poses and train/calibration (ACE), or rgb, pose and intrinsics.txt (NSVF)",
-    _find,
+    LAYOUT.images,
     _read,
     ["depth_unit"],
     precedence=30,  # poses are metric or were scaled on purpose

@@ -10,66 +10,51 @@ Principal points are relative to the centre of the upper left pixel, so half a p
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
+from bidnerf.formats.layouts import Layout, size_of
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import (
     Capture,
     DatasetOptions,
     Format,
-    Shot,
     camera_of,
     first_file,
     read_matrices,
     warn_about,
 )
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.frames import photos_in
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import Row, is_file, read_header, read_rows
+from bidnerf_core.io import is_file, read_rows
+
+LAYOUT = Layout(
+    tuple((f"image_{number}",) for number in (2, 0, 3, 1)),  # the left colour camera first
+    image=r"(\d+)\.\w+",
+    camera=("../calib.txt",),
+)
 
 
-def _read(path: Path, folder: Path, options: DatasetOptions) -> Capture:
+def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
     """Read the lists. Raises ``InputError`` if one is invalid."""
-    images = [file for file in photos_in(folder)[0] if file.stem.isdecimal()]
-    if not images:
-        raise InputError("has no images", where=folder, expected="000000.png ...")
-    header, sequence = read_header(images[0]), path.resolve()
-    number = folder.name.removeprefix("image_")
-    camera, T_first_camera = _calibration(path / "calib.txt", f"P{number}", (header.width, header.height))
+    number, sequence, stamps = images[0].parent.name.removeprefix("image_"), path.resolve(), path / "times.txt"
+    camera, T_first_camera = _calibration(path / "calib.txt", f"P{number}", size_of(images[0]))
     name = f"{sequence.name}.txt"
     file = first_file(path, "poses.txt", name, f"{sequence.parent.parent}/poses/{name}")
-    poses = dict(enumerate([] if file is None else read_matrices(file)))
-    stamps, rows = path / "times.txt", list[Row]()
-    if is_file(stamps):
-        rows = read_rows(stamps, "KITTI's times.txt", "a time in seconds")
-    by_number = {int(image.stem): image for image in images}
-    times = {number: rows[number].numbers(count=1)[0] for number in by_number if number < len(rows)}
+    poses = [] if file is None else [T @ T_first_camera for T in read_matrices(file)]
+    rows = read_rows(stamps, "KITTI's times.txt", "a time in seconds") if is_file(stamps) else []
+    numbers = [int(image.stem) for image in images]
     listed = max(len(poses), len(rows))
-    if gone := listed - sum(number < listed for number in by_number):
-        first = next(number for number in range(listed) if number not in by_number)
-        warn_about(path, f"{gone} of {amount(listed, 'image')} are missing, first: number {first}")
-    shots = [
-        Shot(
-            image=image,
-            camera=camera,
-            T_world_camera=poses[index] @ T_first_camera if index in poses else None,
-            time=times.get(index),
-        )
-        for index, image in by_number.items()
-    ]
+    if gone := sorted(set(range(listed)).difference(numbers)):
+        warn_about(path, f"{len(gone)} of {amount(listed, 'image')} are missing, first: number {gone[0]}")
+    by_name = {i.stem: poses[n] for i, n in zip(images, numbers, strict=True) if n < len(poses)}
+    shots = LAYOUT.shots(images, camera, poses=by_name)
+    times = [rows[number].numbers(count=1)[0] if number < len(rows) else None for number in numbers]
+    shots = [replace(shot, time=time) for shot, time in zip(shots, times, strict=True)]
     expected = f"poses.txt in it, or ../../poses/{name}"
     return Capture(path, shots, options.colour, "metres", pose_file=file, poses_expected=expected)
-
-
-def _find(path: Path) -> Path | None:
-    """Return the folder of the first camera that has images, the left colour camera before others, or None."""
-    if not is_file(path / "calib.txt"):
-        return None
-    folders = (path / f"image_{number}" for number in (2, 0, 3, 1))
-    return next((folder for folder in folders if folder.is_dir()), None)
 
 
 def _calibration(file: Path, camera: str, size: tuple[int, int]) -> tuple[Intrinsics, SE3]:
@@ -89,7 +74,7 @@ def _calibration(file: Path, camera: str, size: tuple[int, int]) -> tuple[Intrin
 reader = Format(
     "KITTI odometry: poses of poses.txt or ../../poses/NN.txt, times of times.txt",
     "calib.txt with image_2 or image_0 (KITTI odometry)",
-    _find,
+    LAYOUT.images,
     _read,
     may_lack_poses=True,
     precedence=30,  # a recording with metric poses

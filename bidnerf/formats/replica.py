@@ -9,26 +9,20 @@ so half a pixel is added.
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
+from bidnerf.formats.layouts import Layout
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.datasets import (
-    Capture,
-    DatasetOptions,
-    DepthFile,
-    Format,
-    Shot,
-    camera_of,
-    first_file,
-    pose_of_matrix,
-)
-from bidnerf_core.depth import DepthReader
+from bidnerf_core.datasets import Capture, DatasetOptions, Format, camera_of, first_file, pose_of_matrix
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import natural_order
-from bidnerf_core.io import Record, is_file, read_record, read_rows
+from bidnerf_core.io import Record, read_record, read_rows
 
 CAMERA_KEYS = ("fx", "fy", "cx", "cy", "scale")
+
+
+LAYOUT = Layout(
+    (("results",),), image=r"(frame[^.]*)\..+", pose=("../traj.txt",), depth=("depth{number}.png",), unmeasured=()
+)
 
 
 def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
@@ -36,37 +30,20 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
     trajectory = path / "traj.txt"
     rows = read_rows(trajectory, "Replica's trajectory", "16 numbers, a 4x4 matrix")
     if len(rows) < len(images):
-        found = f"has {len(rows)} rows for {len(images)} frames"
-        raise InputError(found, where=trajectory, expected="one for each")
-    camera, step = _camera(path)
-    unit, read, shots = options.depth_unit or step, DepthReader(), list[Shot]()
-    for row, image in zip(rows, images, strict=False):
-        depth = image.with_name(f"{image.stem.replace('frame', 'depth')}.png")
-        shots.append(
-            Shot(
-                image=image,
-                camera=camera,
-                T_world_camera=pose_of_matrix(row.where, row.numbers(count=16)),
-                depth=DepthFile(depth, partial(read, depth, unit)) if is_file(depth) else None,
-            )
-        )
-    return Capture(path, shots, options.colour, unit="metres", depth_unit=unit, pose_file=trajectory)
-
-
-def _find(path: Path) -> list[Path]:
-    """Return the images of a posed sequence, in order."""
-    found = (path / "results").glob("frame*") if is_file(path / "traj.txt") else ()
-    return sorted(found, key=lambda file: natural_order(file.name))
-
-
-def _camera(path: Path) -> tuple[Intrinsics, float]:
-    """Return the camera, and the metres per step of depth."""
+        raise InputError(f"has {len(rows)} rows for {len(images)} frames", where=trajectory, expected="one for each")
+    poses = [pose_of_matrix(row.where, row.numbers(count=16)) for row in rows[: len(images)]]
     file = first_file(path, "cam_params.json", f"{path.resolve().parent}/cam_params.json")
-    if file is None:
-        return Intrinsics(600.0, 600.0, 600.0, 340.0, 1200, 680), 1 / 6553.5
+    camera, step = (Intrinsics(600, 600, 600, 340, 1200, 680), 1 / 6553.5) if file is None else _camera(file)
+    unit = options.depth_unit or step
+    shots = LAYOUT.shots(images, camera, unit, poses={i.stem: T for i, T in zip(images, poses, strict=True)})
+    return Capture(path, shots, options.colour, "metres", depth_unit=unit, pose_file=trajectory)
+
+
+def _camera(file: Path) -> tuple[Intrinsics, float]:
+    """Return the camera, and the metres per step of depth. Raises ``InputError`` if one of them is missing."""
     record = read_record(file)
-    camera = record.value("camera")
-    own = record if not isinstance(camera, dict) else Record(f"{file}: camera", camera)
+    inner = record.value("camera")
+    own = Record(f"{file}: camera", inner) if isinstance(inner, dict) else record
     numbers, width, height = [own.number(key) or 0.0 for key in CAMERA_KEYS], own.size("w"), own.size("h")
     if not all(numbers) or width is None or height is None or numbers[4] < 0:
         raise own.error("is incomplete", expected=f"w, h, {', '.join(CAMERA_KEYS)}")
@@ -76,7 +53,7 @@ def _camera(path: Path) -> tuple[Intrinsics, float]:
 reader = Format(
     "Replica of iMAP and NICE-SLAM: depth in the steps of cam_params.json",
     "traj.txt with results/frame000000.jpg (Replica)",
-    _find,
+    LAYOUT.images,
     _read,
     ["depth_unit"],
     may_lack_poses=True,

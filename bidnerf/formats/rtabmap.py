@@ -9,79 +9,59 @@ name are those of the robot, and a remark says so.
 
 from __future__ import annotations
 
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 
+from bidnerf.formats.layouts import Layout
 from bidnerf_core.camera import read_camera
 from bidnerf_core.datasets import (
     Capture,
     DatasetOptions,
-    DepthFile,
     Format,
-    Shot,
-    first_file,
     numbers_in,
     pose_of_matrix,
     pose_of_numbers,
     warn_about,
 )
-from bidnerf_core.depth import MILLIMETRE, DepthReader
-from bidnerf_core.errors import InputError
-from bidnerf_core.frames import photos_in
+from bidnerf_core.depth import MILLIMETRE
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import parse_yaml, read_file, read_header, read_rows
+from bidnerf_core.io import parse_yaml, read_file, read_rows
 
-TRAJECTORY_COLUMNS = "timestamp x y z qx qy qz qw id"
+LAYOUT = Layout(
+    (("*rgb",),),
+    image=r"([^.].*)\.\w+",
+    pose=("../{prefix}camera_poses.txt", "../{prefix}poses.txt"),
+    camera=("../{prefix}calib/{name}.yaml", "../{prefix}calib.yaml"),
+    depth=("../{prefix}depth/{name}.png",),
+    unmeasured=(),
+)
 
 
-def _read(path: Path, match: tuple[Path, Path], options: DatasetOptions) -> Capture:
+def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
     """Read the poses and calibrations. Raises ``InputError`` if one is invalid."""
-    folder, file = match
-    of_robot, prefix = "camera" not in file.name, folder.name.removesuffix("rgb")
+    file, unit = LAYOUT.file(LAYOUT.pose, images[0]), options.depth_unit or MILLIMETRE
     poses, times = dict[str, SE3 | None](), dict[str, float]()
-    for row in read_rows(file, "poses of RTAB-Map", TRAJECTORY_COLUMNS):
+    for row in read_rows(file, "poses of RTAB-Map", "timestamp x y z qx qy qz qw id"):
         if len(row.words) not in (8, 9):
             raise row.error(f" has {len(row.words)} entries; export the poses in format 11")
         numbers = row.plain_numbers(row.words)
         for key in (row.words[0], row.words[-1]):
             poses[key], times[key] = pose_of_numbers(row.where, numbers[1:8], opengl=False), numbers[0]
-    unit, read, shots = options.depth_unit or MILLIMETRE, DepthReader(), list[Shot]()
-    for image in photos_in(folder)[0]:
-        calibration = first_file(path, f"{prefix}calib/{image.stem}.yaml", f"{prefix}calib.yaml")
-        if calibration is None:
-            raise InputError("has no calibration", where=image, expected=f"{prefix}calib/{image.stem}.yaml")
-        header, depth = read_header(image), first_file(path / f"{prefix}depth", f"{image.stem}.png")
-        T_world_camera, T_robot_camera = poses.get(image.stem), _local_transform(calibration) if of_robot else None
-        if T_world_camera is not None and T_robot_camera is not None:
-            T_world_camera = T_world_camera @ T_robot_camera
-        if not shots and T_robot_camera is not None:
+    if "camera" not in file.name:
+        mounted = {image.stem: _local_transform(LAYOUT.file(LAYOUT.camera, image)) for image in images}
+        poses |= {name: T @ T_robot for name, T_robot in mounted.items() if T_robot and (T := poses.get(name))}
+        if any(mounted.values()):
             warn_about(
                 file, "is taken for poses of the robot, from which those of its camera follow by local_transform"
             )
-        shots.append(
-            Shot(
-                image=image,
-                camera=read_camera(calibration, (header.width, header.height)),
-                T_world_camera=T_world_camera,
-                time=times.get(image.stem),
-                depth=None if depth is None else DepthFile(depth, partial(read, depth, unit)),
-            )
-        )
+    shots = LAYOUT.shots(images, read_camera, unit, poses=poses)
+    shots = [replace(shot, time=times.get(shot.stem)) for shot in shots]
     expected = "a row with the time or the number of each image"
     return Capture(path, shots, options.colour, "metres", depth_unit=unit, pose_file=file, poses_expected=expected)
 
 
-def _find(path: Path) -> tuple[Path, Path] | None:
-    """Return the folder of the images and the file of the poses, those of the camera before those of the robot."""
-    for folder in (folder for folder in sorted(path.glob("*rgb")) if folder.is_dir()):
-        prefix = folder.name.removesuffix("rgb")
-        poses = first_file(path, f"{prefix}camera_poses.txt", f"{prefix}poses.txt")
-        if poses is not None and any(path.glob(f"{prefix}calib*")):
-            return folder, poses
-    return None
-
-
 def _local_transform(calibration: Path) -> SE3 | None:
+    """Return ``T_robot_camera``, or None if the calibration does not state it."""
     values = parse_yaml(read_file(calibration, "a calibration"), str(calibration), "a calibration")
     found = values.get("local_transform") if isinstance(values, dict) else None
     if not isinstance(found, dict) or not isinstance(found.get("data"), list):
@@ -93,7 +73,7 @@ def _local_transform(calibration: Path) -> SE3 | None:
 reader = Format(
     "RTAB-Map: exported images, depth, calibrations and poses of the camera or the robot",
     "rtabmap_rgb with rtabmap_calib and rtabmap_poses.txt (RTAB-Map)",
-    _find,
+    LAYOUT.images,
     _read,
     ["depth_unit"],
     precedence=30,  # a recording with metric poses

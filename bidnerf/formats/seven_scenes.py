@@ -22,20 +22,19 @@ or ``cameras.txt``, describes the colour images; without registration, it descri
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Collection
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import torch
 
-from bidnerf_core.camera import CameraSource, Intrinsics, folder_camera
-from bidnerf_core.datasets import Capture, DatasetOptions, DepthFile, Format, Shot, read_pose_matrix
-from bidnerf_core.depth import MILLIMETRE, DepthCamera, DepthImage, DepthReader
+from bidnerf.formats.layouts import Layout
+from bidnerf_core.camera import Intrinsics, folder_camera
+from bidnerf_core.datasets import Capture, DatasetOptions, Format, Shot
+from bidnerf_core.depth import MILLIMETRE, DepthCamera
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import natural_order
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import is_file, read_rows
+from bidnerf_core.io import read_rows
 
 DEPTH_CAMERA = Intrinsics(585, 585, 320, 240, 640, 480)
 COLOUR_CAMERA = Intrinsics(525, 525, 320, 240, 640, 480)
@@ -53,28 +52,34 @@ T_COLOUR_DEPTH = SE3(
 """Pose of another Kinect's depth camera in its colour camera's frame, as used by ACE's ``setup_7scenes.py``:
 https://projet.liris.cnrs.fr/voir/activities-dataset/kinect-calibration.html."""
 
-SEQUENCE = re.compile(r"seq(?:uence)?-?0*(\d+)", re.IGNORECASE)
+LAYOUT = Layout(
+    (("seq*[0-9]",), (".",)),
+    image=r"(frame-\d+)\.color\.(?:png|jpe?g)",
+    pose=("{name}.pose.txt",),
+    depth=("{name}.depth.png",),
+)
 
 
-def _read(path: Path, folders: dict[int, Path], options: DatasetOptions) -> Capture:
+def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
     """Read the poses and splits. Raises ``InputError`` if any of them is invalid.
 
     Poses and depth are transferred from the depth sensor to the colour camera, by default with a Kinect's calibration.
     """
     sensor = options.sensor(path, DepthCamera(DEPTH_CAMERA, T_COLOUR_DEPTH))
     camera = folder_camera(path, options.given_camera, DEPTH_CAMERA if sensor is None else COLOUR_CAMERA)
-    unit, read_depth = options.depth_unit or MILLIMETRE, DepthReader(documented=("65535",))
+    unit = options.depth_unit or MILLIMETRE
     T_depth_colour = SE3.identity() if sensor is None else sensor.T_colour_depth.inverse()
-    lists = {"train": path / "TrainSplit.txt", "test": path / "TestSplit.txt"}
-    numbers = {
-        split: _read_split(file, folders) for split, file in lists.items() if -1 not in folders and file.is_file()
-    }
+    number_of = {folder: int("".join(re.findall(r"\d+$", folder.name)) or -1) for folder in {i.parent for i in images}}
+    splits = dict[int, tuple[str, ...]]()
+    for split, file in (("train", path / "TrainSplit.txt"), ("test", path / "TestSplit.txt")):
+        if path not in number_of and file.is_file():
+            for number in _read_split(file, number_of.values()):
+                splits[number] = *splits.get(number, ()), split
     shots = list[Shot]()
-    for number in dict.fromkeys(n for group in numbers.values() for n in group) or sorted(folders):
-        splits = tuple(split for split, group in numbers.items() if number in group)
-        for shot in frames_of(folders[number], camera, partial(read_depth, unit=unit), sensor):
-            T = shot.T_world_camera
-            shots.append(shot if T is None else replace(shot, T_world_camera=T @ T_depth_colour, splits=splits))
+    for image, shot in zip(images, LAYOUT.shots(images, camera, unit, sensor), strict=True):
+        T, own = shot.T_world_camera, splits.get(number_of[image.parent], ())
+        if own or not splits:
+            shots.append(shot if T is None else replace(shot, T_world_camera=T @ T_depth_colour, splits=own))
     return Capture(
         path,
         shots,
@@ -85,49 +90,16 @@ def _read(path: Path, folders: dict[int, Path], options: DatasetOptions) -> Capt
     )
 
 
-def _find(path: Path) -> dict[int, Path]:
-    """Return the sequence folders by number; if ``path`` is itself a sequence, its number is -1."""
-    found = {child: SEQUENCE.fullmatch(child.name) for child in path.glob("seq*") if child.is_dir()}
-    folders = {int(match[1]): child for child, match in found.items() if match}
-    if any(map(images_of, folders.values())):
-        return folders
-    return {-1: path} if images_of(path) else {}
-
-
-def images_of(folder: Path) -> list[Path]:
-    """Return the colour images of a folder in the order of their numbers."""
-    name = re.compile(r"frame-\d+\.color\.(?:png|jpe?g)", re.IGNORECASE)
-    found = [file for file in folder.glob("frame-*") if name.fullmatch(file.name)]
-    return sorted(found, key=lambda file: natural_order(file.name))
-
-
-def frames_of(
-    folder: Path, camera: CameraSource, read_depth: Callable[[Path], DepthImage], sensor: DepthCamera | None
-) -> list[Shot]:
-    """Return the frames of a folder with their poses as stored. Raises ``InputError`` if there are no frames."""
-    images, shots = images_of(folder), list[Shot]()
-    if not images:
-        raise InputError("has no frames", where=folder, expected="frame-000000.color.png ...")
-    for image in images:
-        stem = image.name.partition(".")[0]
-        depth, pose = (folder / f"{stem}.{kind}" for kind in ("depth.png", "pose.txt"))
-        measured = DepthFile(depth, partial(read_depth, depth), sensor) if is_file(depth) else None
-        T = read_pose_matrix(pose)
-        shots.append(Shot(image=image, stem=stem, camera=camera, T_world_camera=T, depth=measured))
-    return shots
-
-
-def _read_split(file: Path, folders: dict[int, Path]) -> list[int]:
-    """Return the numbers of the sequences in a split file. Raises ``InputError`` if it lists none or an unknown one."""
+def _read_split(file: Path, known: Collection[int]) -> list[int]:
+    """Return the numbers of the sequences in a split file. Raises ``InputError`` if it lists none or one that is not ``known``."""
     numbers = list[int]()
     for row in read_rows(file, "a list of sequences", "a sequence such as sequence1"):
-        found = SEQUENCE.fullmatch(row.text)
-        if found is None:
+        match = re.fullmatch(r"seq(?:uence)?-?0*(\d+)", row.text, re.IGNORECASE)
+        if match is None:
             raise row.error(f": {row.text[:40]!r}")
-        number = int(found[1])
-        if number not in folders:
-            raise InputError(f"no folder for {row.text}", where=row.where, expected=f"seq-{number:02d}")
-        numbers.append(number)
+        numbers.append(int(match[1]))
+        if numbers[-1] not in known:
+            raise InputError(f"no folder for {row.text}", where=row.where, expected=f"seq-{numbers[-1]:02d}")
     if not numbers:
         raise InputError("lists no sequences", where=file, expected="lines such as sequence1")
     return numbers
@@ -136,7 +108,7 @@ def _read_split(file: Path, folders: dict[int, Path]) -> list[int]:
 reader = Format(
     "7-Scenes: splits of TrainSplit.txt and TestSplit.txt, depth registered to the colour camera",
     "frame-000000.color.png ... in the folder or in seq-01 ... (7-Scenes)",
-    _find,
+    LAYOUT.images,
     _read,
     ("camera", "register_depth", "depth_unit"),
     may_lack_poses=True,

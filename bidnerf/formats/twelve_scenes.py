@@ -13,22 +13,24 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
-from bidnerf.formats.seven_scenes import frames_of, images_of
+from bidnerf.formats.seven_scenes import LAYOUT as SEVEN_SCENES
 from bidnerf_core.camera import CameraSource, Intrinsics
 from bidnerf_core.datasets import Capture, DatasetOptions, Format, Shot, camera_of, first_file, numbers_in, pixel_size
-from bidnerf_core.depth import MILLIMETRE, DepthCamera, DepthReader
+from bidnerf_core.depth import MILLIMETRE, DepthCamera
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import read_rows
 
+LAYOUT = replace(
+    SEVEN_SCENES, folders=(("data",), (".",)), camera=("../info.txt", "../_info.txt", "info.txt", "_info.txt")
+)
 
-def _read(path: Path, match: tuple[Path, Path], options: DatasetOptions) -> Capture:
+
+def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
     """Read the poses and splits. Raises ``InputError`` if a metadata file is invalid."""
-    folder, info = match
-    values: dict[str, list[float]] = {}
+    info, values = LAYOUT.file(LAYOUT.camera, images[0]), dict[str, list[float]]()
     for row in read_rows(info, "12-Scenes' info.txt", "name = numbers"):
         name, _, text = row.text.partition("=")
         if name.strip().startswith(("m_calibration", "m_color", "m_depth")):
@@ -38,8 +40,7 @@ def _read(path: Path, match: tuple[Path, Path], options: DatasetOptions) -> Capt
         expected = "16 numbers, with m_colorWidth and m_colorHeight"
         raise InputError("no m_calibrationColorIntrinsic", where=info, expected=expected)
     unit, sensor = options.depth_unit or MILLIMETRE, options.sensor(path, own_sensor(colour, depth))
-    read_depth = partial(DepthReader(documented=("65535",)), unit=unit)
-    shots = frames_of(folder, CameraSource(options.given_camera or colour), read_depth, sensor)
+    shots = LAYOUT.shots(images, CameraSource(options.given_camera or colour), unit, sensor)
     return Capture(
         path,
         _in_splits(path, shots),
@@ -48,13 +49,6 @@ def _read(path: Path, match: tuple[Path, Path], options: DatasetOptions) -> Capt
         depth_unit=unit,
         poses_expected="frame-000000.pose.txt of finite numbers",
     )
-
-
-def _find(path: Path) -> tuple[Path, Path] | None:
-    """Return the folder of the frames and the file with their cameras."""
-    folder = next((each for each in (path / "data", path) if images_of(each)), None)
-    info = first_file(path, "info.txt", "_info.txt", "../info.txt", "../_info.txt")
-    return None if folder is None or info is None else (folder, info)
 
 
 def own_sensor(colour: Intrinsics, depth: Intrinsics | None) -> DepthCamera | None:
@@ -96,7 +90,7 @@ def _in_splits(path: Path, shots: list[Shot]) -> list[Shot]:
 reader = Format(
     "12-Scenes: the first sequence of split.txt is the test, depth registered to the colour camera",
     "info.txt with data/frame-000000.color.jpg ... (12-Scenes)",
-    _find,
+    LAYOUT.images,
     _read,
     ("camera", "register_depth", "depth_unit"),
     precedence=35,  # its images have the names of 7-Scenes' ones
