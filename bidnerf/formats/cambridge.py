@@ -13,10 +13,9 @@ Map-free: ``poses.txt`` has rows of a name, the quaternion (w x y z) and the tra
 from __future__ import annotations
 
 from pathlib import Path, PurePosixPath
+from typing import TypeAlias
 
-import torch
-from scipy.spatial.transform import Rotation
-
+from bidnerf.formats.layouts import size_of
 from bidnerf.formats.reality_capture import file_heads
 from bidnerf_core.camera import CameraSource, Intrinsics
 from bidnerf_core.datasets import (
@@ -27,43 +26,45 @@ from bidnerf_core.datasets import (
     Shot,
     camera_of,
     first_file,
-    pose_numbers,
+    pose_of_numbers,
 )
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import Row, is_file, read_header, read_rows
+from bidnerf_core.io import Row, is_file, read_rows
 
 LISTS = {"train": "dataset_train.txt", "test": "dataset_test.txt"}
+Listed: TypeAlias = tuple[Row, list[float]]
+"""The row of an image, and the numbers after its name."""
 
 
 def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
     """Read the lists. Raises ``InputError`` if one is invalid."""
-    map_free, model = file.name == "poses.txt", next(iter(sorted(path.glob("*.nvm"))), None)
-    lenses = {_stem(name): (row, numbers) for name, row, numbers in ([] if model is None else _rows(model, 10))}
-    if map_free:
-        lenses = {_stem(name): (row, numbers) for name, row, numbers in _rows(path / "intrinsics.txt", 6)}
-    listed = [
-        (split, *entry) for split, name in LISTS.items() if is_file(path / name) for entry in _rows(path / name, 7)
-    ]
-    if not listed and model is not None:
-        listed = [("", name, row, [*n[5:8], *n[1:5]]) for name, row, n in _rows(model, 10)]
-    if map_free:
-        listed = [("", name, row, [*n[4:], *n[:4]]) for name, row, n in _rows(file, 7)]
-    names, shots = FileNames(path, path / "images", images=options.image_folder), list[Shot]()
-    for split, name, row, numbers in listed:
-        image, found = names.image(name), pose_numbers(row.where, numbers, "wxyz")
-        if found is None:
-            raise row.error(": is no pose")
-        position = torch.tensor(found[:3], dtype=torch.float64)
-        T_camera_world = SE3(torch.from_numpy(Rotation.from_quat(found[3:]).as_matrix()), position)
-        pose = T_camera_world.inverse() if map_free else SE3(T_camera_world.rotation.T, position)
-        lens = None if options.camera_source.is_given else lenses.get(_stem(name))
-        camera = options.camera_source if lens is None or not is_file(image) else CameraSource(_camera(*lens, image))
-        shots.append(Shot(image=image, camera=camera, T_world_camera=pose, splits=(split,) if split else ()))
-    if not shots:
+    model, images = next(iter(sorted(path.glob("*.nvm"))), None), dict[str, tuple[str, Row, list[float]]]()
+    rows = {} if model is None else _rows(model, 10)
+    lists = {split: _rows(path / name, 7) for split, name in LISTS.items() if is_file(path / name)}
+    map_free = file.name == "poses.txt"
+    if map_free:  # of which lists have the quaternion first
+        rows, lists[""] = _rows(path / "intrinsics.txt", 6), _rows(file, 7)
+    for split, listed in (lists or {"": rows}).items():
+        for name, (row, n) in listed.items():
+            images[name] = split, row, [*n[-3:], *n[:-3]] if map_free else n if lists else [*n[5:8], *n[1:5]]
+    if not images:
         raise InputError("lists no images", where=file, expected="rows of a name and a pose")
-    is_model = file.suffix == ".nvm"
-    return Capture(path, shots, options.colour, None if is_model else "metres", pose_file=file)
+    lenses = {_stem(name): listed for name, listed in rows.items()}
+
+    def read(image: Path, name: str, entry: tuple[str, Row, list[float]]) -> Shot:
+        split, row, (x, y, z, qw, *q) = entry
+        T = pose_of_numbers(row.where, [x, y, z, *q, qw], opengl=False)
+        if T is None:
+            raise row.error(": is no pose")
+        # Lists have the position beside the rotation to the camera, those of Map-free the translation.
+        pose, lens = T.inverse() if map_free else SE3(T.rotation.mT, T.translation), lenses.get(_stem(name))
+        is_known = lens is not None and not options.camera_source.is_given
+        camera = CameraSource(_camera(*lens, image)) if lens and is_known else options.camera_source
+        return Shot(image=image, camera=camera, T_world_camera=pose, splits=(split,) if split else ())
+
+    names, unit = FileNames(path, path / "images", images=options.image_folder), file.suffix != ".nvm"
+    return Capture(path, names.shots(images, read), options.colour, "metres" if unit else None, pose_file=file)
 
 
 def _find(path: Path) -> Path | None:
@@ -75,20 +76,18 @@ def _find(path: Path) -> Path | None:
     return first_file(path, *LISTS.values()) or next(iter(sorted(path.glob("*.nvm"))), None)
 
 
-def _rows(file: Path, count: int) -> list[tuple[str, Row, list[float]]]:
-    """Return the rows of a name and ``count`` numbers, each with its name and numbers; a heading is left out."""
+def _rows(file: Path, count: int) -> dict[str, Listed]:
+    """Return the rows of a name and ``count`` numbers by name, each with its numbers; a heading is left out."""
     rows = read_rows(file, "a list of images", f"a name and {count} numbers")
     if file.suffix == ".nvm":
         most = next((int(row.text) for row in rows[1:2] if row.text.isdecimal() and len(row.text) < 9), 0)
         rows = rows[2 : 2 + most]
     elif rows and rows[0].text.startswith("Visual Landmark Dataset"):
         rows = rows[2:]
-    found = list[tuple[str, Row, list[float]]]()
+    found = dict[str, Listed]()
     for row in rows:
         name, *words = row.text.rsplit(maxsplit=count)
-        if len(words) != count:
-            raise row.error(f" has {len(row.words)} entries")
-        found.append((name, row, row.numbers(words)))
+        found[name] = row, row.numbers(words, count)
     return found
 
 
@@ -99,8 +98,7 @@ def _stem(name: str) -> str:
 def _camera(row: Row, numbers: list[float], image: Path) -> Intrinsics:
     if len(numbers) == 6:
         return camera_of(row.where, numbers[:4], (round(numbers[4]), round(numbers[5])), first_centre=0)
-    header, focal, r = read_header(image), numbers[0], numbers[8]
-    size = header.width, header.height
+    size, focal, r = size_of(image), numbers[0], numbers[8]
     lens = (-r, 3 * r * r, 0.0, 0.0, -12 * r**3)
     return camera_of(row.where, (focal, focal, size[0] / 2, size[1] / 2), size, lens, first_centre=0)
 

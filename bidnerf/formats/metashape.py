@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
-from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 from bidnerf.formats.reality_capture import file_heads
 from bidnerf_core.camera import Camera, PanoramaFace, agisoft_camera
@@ -29,9 +29,8 @@ from bidnerf_core.datasets import (
     warn_about,
 )
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.frames import natural_order
-from bidnerf_core.geometry import SE3
-from bidnerf_core.io import is_file, parse_xml, read_file
+from bidnerf_core.geometry import SE3, Similarity
+from bidnerf_core.io import parse_xml, read_file
 
 
 def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
@@ -41,35 +40,34 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
     lenses = {key: _camera(sensor, f"{file}: sensor {key}") for key, sensor in sensors.items()}
     metric = chunk.find("transform/scale")
     scale = 1.0 if metric is None else _scale(f"{file}: the scale of the chunk", metric)
-    names = FileNames(path, *(path / place for place in ("images", "photos", "input")), images=options.image_folder)
-    listed = list(chunk.iter("camera"))
-    cameras = {camera.get("label") or "": camera for camera in listed}
-    if len(cameras) < len(listed):
+    listed, frames = list(chunk.iter("camera")), _components(file, chunk)
+    masters, labels = {camera.get("id"): camera for camera in listed}, {camera.get("label") for camera in listed}
+    if len(labels) < len(listed):
         raise InputError("two cameras have the same label", where=file, expected="unique labels of photos")
-    shots, frames, masters = list[Shot](), _components(file, chunk), {camera.get("id"): camera for camera in listed}
-    for label in sorted(cameras, key=natural_order):
-        camera, where, image = cameras[label], f"{file}: camera {label}", names.image(label)
-        if not is_file(image):  # its sensor may never have been calibrated
-            shots.append(Shot(image=image))
-            continue
-        sensor = lenses.get(camera.get("sensor_id"))
-        if sensor is None:
+
+    def master_of(camera: Element) -> Element:
+        """Return the camera whose pose and component those of a rig have, their sensors having poses in its frame."""
+        return masters.get(camera.get("master_id"), camera)
+
+    def read(image: Path, label: str, camera: Element) -> Shot:
+        where, lens, master = f"{file}: camera {label}", lenses.get(camera.get("sensor_id")), master_of(camera)
+        if lens is None:
             raise InputError("has no calibrated sensor", where=where, expected="the id of one")
-        # The cameras of a rig have the pose of their master; their sensors have a pose in the master's frame.
-        master = masters.get(camera.get("master_id"), camera)
-        frame, transform = frames.get(master.get("component_id"), (1.0, SE3.identity())), master.find("transform")
-        pose = None
-        if transform is not None and frame is not None:
+        transform, pose = master.find("transform"), None
+        if transform is not None:
             pose = pose_of_matrix(where, numbers_in(where, transform.text or "", 16))
             if master is not camera:
                 pose = pose @ _pose(where, sensors[camera.get("sensor_id")], "location")
-            pose = SE3(pose.rotation, pose.translation * frame[0])
-            pose = frame[1] @ pose
-            pose = SE3(pose.rotation, pose.translation * scale)
-        shots.append(Shot(image=image, camera=sensor, T_world_camera=pose))
+            component = frames[master.get("component_id")]
+            assert component is not None  # the others are not listed below
+            pose = Similarity(scale, SE3.identity()).move(component.move(pose))
+        return Shot(image=image, camera=lens, T_world_camera=pose)
+
+    names = FileNames(path, *(path / place for place in ("images", "photos", "input")), images=options.image_folder)
+    cameras = {c.get("label") or "": c for c in listed if frames.get(master_of(c).get("component_id"), "none")}
     return Capture(
         path,
-        shots,
+        names.shots(cameras, read),
         options.colour,
         unit=None if metric is None else "metres",
         pose_file=file,
@@ -84,7 +82,7 @@ def _find(path: Path) -> Path | None:
     return next((file for file, head in heads if b"<document" in head and b"<chunk" in head), None)
 
 
-def _chunk(file: Path) -> ElementTree.Element:
+def _chunk(file: Path) -> Element:
     """Return the chunk with the most cameras, with a remark if several have cameras. Raises ``InputError`` for invalid XML."""
     expected = "cameras exported by Metashape"
     chunks = parse_xml(read_file(file, expected), str(file), expected).findall("chunk")
@@ -99,49 +97,45 @@ def _chunk(file: Path) -> ElementTree.Element:
     return chunks[count.index(max(count))]
 
 
-def _components(file: Path, chunk: ElementTree.Element) -> dict[str | None, tuple[float, SE3] | None]:
-    """Return the scale and pose in the chunk of each component by its id, or None for one that is not connected to those used.
+def _components(file: Path, chunk: Element) -> dict[str | None, Similarity | None]:
+    """Return the frames in the chunk of the components with posed cameras, by their ids; None for those that are not used.
 
     Components whose transform is complete are connected; each of the others has a frame of its own. The connected ones, or
-    one other, are used, whichever has more images.
+    one other, are used, whichever has more images; a remark says how many images these are.
     """
-    used, known = Counter[str | None](), dict[str | None, tuple[float, SE3] | None]()
-    for camera in chunk.iter("camera"):
-        used[camera.get("component_id")] += camera.find("transform") is not None
+    posed = Counter(
+        camera.get("component_id") for camera in chunk.iter("camera") if camera.find("transform") is not None
+    )
+    connected = dict[str | None, Similarity]()
     for component in chunk.findall("components/component"):
         transform, where = component.find("transform"), f"{file}: component {component.get('id')}"
         if transform is not None and transform.find("translation") is not None:
-            scale = transform.find("scale")
-            known[component.get("id")] = (
-                1.0 if scale is None else _scale(f"{where}: its scale", scale),
-                _pose(where, transform, "translation"),
-            )
-    others = [key for key, count in used.most_common() if count and key not in known]
-    together = sum(used[key] for key in known)
-    if others and used[others[0]] > together:
-        known = {**dict.fromkeys(known, None), others.pop(0): (1.0, SE3.identity())}
-    left = [*others, *(key for key, frame in known.items() if frame is None and used[key])]
-    if left:
-        count = sum(used.values()) - sum(used[key] for key in left)
+            element = transform.find("scale")
+            scale = 1.0 if element is None else _scale(f"{where}: its scale", element)
+            connected[component.get("id")] = Similarity(scale, _pose(where, transform, "translation"))
+    alone = [{key: Similarity(1.0, SE3.identity())} for key in posed if key not in connected]
+    used = max([connected, *alone], key=lambda frames: sum(posed[key] for key in frames))
+    count = sum(posed[key] for key in used)
+    if count < posed.total():
         warn_about(file, f"its components are not connected; the largest is used, with {amount(count, 'image')}")
-    return known | dict.fromkeys(others, None)
+    return dict[str | None, Similarity | None].fromkeys(posed) | used
 
 
-def _pose(where: str, element: ElementTree.Element, position: str) -> SE3:
+def _pose(where: str, element: Element, position: str) -> SE3:
     """Return a pose from its ``rotation`` (row by row) and the ``position``."""
     turn = numbers_in(f"{where}: rotation", element.findtext("rotation") or "1 0 0 0 1 0 0 0 1", 9)
     x = numbers_in(f"{where}: {position}", element.findtext(position) or "0 0 0", 3)
     return pose_of_matrix(where, [*turn[:3], x[0], *turn[3:6], x[1], *turn[6:], x[2]])
 
 
-def _scale(where: str, element: ElementTree.Element) -> float:
+def _scale(where: str, element: Element) -> float:
     (scale,) = numbers_in(where, element.text or "", 1)
     if not 0 < scale < 1e10:
         raise InputError(f"is {scale:g}", where=where, expected="a positive number")
     return scale
 
 
-def _camera(sensor: ElementTree.Element, where: str) -> Camera | None:
+def _camera(sensor: Element, where: str) -> Camera | None:
     """Return the camera of a sensor; None if it is not calibrated."""
     size, found = sensor.find("resolution"), sensor.findall("calibration")
     adjusted = [each for each in found if each.get("class") in ("adjusted", None)][-1:] or found[:1]

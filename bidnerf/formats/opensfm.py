@@ -12,6 +12,7 @@ centre in our convention too. Photos are in ``images``.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import torch
 from scipy.spatial.transform import Rotation
@@ -28,12 +29,12 @@ from bidnerf_core.datasets import (
     warn_about,
 )
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import natural_order
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import Record, is_file, read_json
+from bidnerf_core.io import Record, read_json
 
 PROJECTIONS = ("perspective", "brown", "simple_radial", "radial", "fisheye_opencv")
 """The projection types that are read, besides panoramas."""
+POSE_KEYS = ("rotation", "translation")
 
 
 def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
@@ -45,40 +46,29 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
         expected = "a list of reconstructions with shots and cameras"
         raise InputError("has no shots", where=file, expected=expected)
     part = max(parts, key=lambda part: len(part["shots"]))
-    entries, cameras = part["shots"], part.get("cameras")
+    entries, cameras, known = part["shots"], part.get("cameras"), dict[str, Camera]()
     if len(parts) > 1:
         warn_about(file, f"has {len(parts)} reconstructions, of which the one with {len(entries)} images is used")
-    others = (".", "images", "opensfm/images", "../images")
-    names, shots = FileNames(*(path / place for place in others), images=options.image_folder), list[Shot]()
-    known = dict[str, Camera]()
-    for name in sorted(entries, key=natural_order):
-        where, entry, image = f"{file}: {name}", entries[name], names.image(name)
-        if not is_file(image):
-            shots.append(Shot(image=image))
-            continue
-        record = Record(where, entry if isinstance(entry, dict) else {})
+
+    def read(image: Path, name: str, entry: Any) -> Shot:
+        record = Record(f"{file}: {name}", entry if isinstance(entry, dict) else {})
         key = str(record.value("camera"))
         own = cameras.get(key) if isinstance(cameras, dict) else None
         if not isinstance(own, dict):
             raise record.error(f"has the camera {key[:60]!r}", expected="one of cameras")
         if key not in known:
-            known[key] = _camera(Record(f"{where}: camera", own))
-        turn, position = (
-            [record.checked_number(n, key) for n in record.items(key) or []] for key in ("rotation", "translation")
-        )
+            known[key] = _camera(Record(f"{record.where}: camera", own))
+        turn, position = ([record.checked_number(n, k) for n in record.items(k) or []] for k in POSE_KEYS)
         if not len(turn) == len(position) == 3:
             raise record.error("has no pose", expected="rotation and translation of 3 numbers each")
         rotation = torch.from_numpy(Rotation.from_rotvec(turn).as_matrix())
-        T_camera_world = SE3(rotation, torch.tensor(position, dtype=torch.float64))
-        shots.append(
-            Shot(
-                image=image,
-                camera=known[key],
-                T_world_camera=T_camera_world.inverse(),
-                time=record.number("capture_time") or None,  # 0 where a photo does not record it
-            )
-        )
-    return Capture(path, shots, options.colour, pose_file=file)
+        T_world_camera = SE3(rotation, torch.tensor(position, dtype=torch.float64)).inverse()
+        time = record.number("capture_time") or None  # 0 where a photo does not record it
+        return Shot(image=image, camera=known[key], T_world_camera=T_world_camera, time=time)
+
+    others = (".", "images", "opensfm/images", "../images")
+    names = FileNames(*(path / place for place in others), images=options.image_folder)
+    return Capture(path, names.shots(entries, read), options.colour, pose_file=file)
 
 
 def _find(path: Path) -> Path | None:
@@ -99,10 +89,8 @@ def _camera(record: Record) -> Camera:
     if fx is None or fy is None:
         raise record.error("no focal", expected="the focal length, relative to the longer side")
 
-    def number(key: str) -> float:
-        return record.number(key) or 0.0
-
-    k1, k2, p1, p2, k3, k4, cx, cy = map(number, ("k1", "k2", "p1", "p2", "k3", "k4", "c_x", "c_y"))
+    keys = ("k1", "k2", "p1", "p2", "k3", "k4", "c_x", "c_y")
+    k1, k2, p1, p2, k3, k4, cx, cy = (record.number(key) or 0.0 for key in keys)
     numbers = fx * side, fy * side, cx * side + width / 2, cy * side + height / 2
     if kind == "fisheye_opencv":
         return colmap_camera(record.where, "OPENCV_FISHEYE", width, height, [*numbers, k1, k2, k3, k4])

@@ -17,6 +17,7 @@ from pathlib import Path
 import torch
 from scipy.spatial.transform import Rotation
 
+from bidnerf.formats.layouts import size_of
 from bidnerf_core.datasets import (
     Capture,
     DatasetOptions,
@@ -28,9 +29,8 @@ from bidnerf_core.datasets import (
     read_table,
 )
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import natural_order
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import Row, is_file, open_binary, read_header
+from bidnerf_core.io import Row, open_binary
 
 POSE_FIELDS = ("x", "y", "alt", "heading", "pitch", "roll")
 
@@ -40,9 +40,7 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
     columns = "the columns of the export 'Internal/External camera parameters', which has focal lengths (f)"
     names = FileNames(path, path / "images", path / "input", images=options.image_folder)
     rows = read_table(file, "a list of cameras", columns, {"name", "f", *POSE_FIELDS})
-    shots = [_shot(row, values, names.image(values["name"])) for row, values in rows]
-    shots.sort(key=lambda shot: natural_order(f"{shot.file}"))
-    return Capture(path, shots, options.colour, pose_file=file)
+    return Capture(path, names.shots({v["name"]: (row, v) for row, v in rows}, _shot), options.colour, pose_file=file)
 
 
 def _find(path: Path) -> Path | None:
@@ -60,7 +58,9 @@ def file_heads(path: Path, pattern: str, expected: str) -> Iterator[tuple[Path, 
             yield file, opened.read(4096)
 
 
-def _shot(row: Row, values: dict[str, str], image: Path) -> Shot:
+def _shot(image: Path, name: str, listed: tuple[Row, dict[str, str]]) -> Shot:
+    row, values = listed
+
     def number(key: str) -> float:
         return row.numbers([values.get(key) or "0"])[0]
 
@@ -70,12 +70,9 @@ def _shot(row: Row, values: dict[str, str], image: Path) -> Shot:
     pose = SE3(turn * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64), position)
     if number("k4") != 0:
         raise row.error(": k4 is not 0, which OpenCV's model does not support; export undistorted images instead")
-    if not is_file(image):
-        return Shot(image=image)
-    header = read_header(image)
-    size, longer = (header.width, header.height), max(header.width, header.height)
-    focal = number("f") * longer / 36.0  # focal lengths refer to a film 36 mm wide
-    centre = header.width / 2 + number("px") * longer, header.height / 2 + number("py") * longer
+    size = width, height = size_of(image)
+    focal = number("f") * max(size) / 36.0  # focal lengths refer to a film 36 mm wide
+    centre = width / 2 + number("px") * max(size), height / 2 + number("py") * max(size)
     lens = [number(key) for key in ("k1", "k2", "t1", "t2", "k3")]
     lens = lens if lens[4] else lens[:4]
     camera = camera_of(row.where, (focal, focal, *centre), size, lens, first_centre=0)

@@ -59,7 +59,7 @@ class PoserContract(Named):
         )
         found, true = SE3.stack([view.T_ref_camera for view in views]), SE3.stack([truth[name] for name in names])
         aligned = fit_similarity(found.translation, true.translation)
-        moved = SE3(aligned.T_target_source.rotation @ found.rotation, aligned.apply(found.translation))
+        moved = aligned.move(found)
         error = float((true.inverse() @ moved).log().norm(dim=-1).max())
         require(
             self._who,

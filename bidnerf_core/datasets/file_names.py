@@ -9,12 +9,16 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping
 from itertools import takewhile
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import TypeVar
 
-from bidnerf_core.datasets.capture import warn_about
+from bidnerf_core.datasets.capture import Shot, warn_about
+from bidnerf_core.frames import natural_order
 from bidnerf_core.io import HEIF_SUFFIXES, IMAGE_SUFFIXES, is_file
 
+Entry = TypeVar("Entry")
 IMAGE_ENDINGS = ("", *IMAGE_SUFFIXES, *HEIF_SUFFIXES)
 AUXILIARY = re.compile(
     r"(.*[_.-])?(depths?|masks?|conf(idence)?|thumb(nail)?s?|normals?|disp(arity)?|semantics?|segmentations?|labels?|instances?)"
@@ -91,6 +95,11 @@ class FileNames:
                 self._root, f"{str(name)!r} is taken for {os.path.relpath(found, self._root)}, and others likewise"
             )
         return found
+
+    def shots(self, entries: Mapping[str, Entry], read: Callable[[Path, str, Entry], Shot]) -> list[Shot]:
+        """Return the images that are listed by name, in natural order; ``read`` makes a shot of an existing file and its entry."""
+        files = {name: self.image(name) for name in sorted(entries, key=natural_order)}
+        return [read(f, name, entries[name]) if is_file(f) else Shot(image=f) for name, f in files.items()]
 
     def _elsewhere(self, name: PurePosixPath) -> Path | None:
         """Return the only image with the same name but for its extension and folders, those with most folders in common first."""

@@ -129,6 +129,10 @@ class Similarity:
     def apply(self, points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
         return self.T_target_source.apply(self.scale * points)
 
+    def move(self, T_source_camera: SE3) -> SE3:
+        """Return ``T_target_camera``, the pose of a camera in the target frame."""
+        return SE3(self.T_target_source.rotation @ T_source_camera.rotation, self.apply(T_source_camera.translation))
+
 
 def fit_similarity(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Similarity:
     """Return the similarity that maps ``source`` to ``target`` in the least-squares sense (Umeyama 1991, eqs.

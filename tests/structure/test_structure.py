@@ -103,16 +103,7 @@ def errors(views: dict[str, bn.View], truth: dict[str, bn.SE3]) -> tuple[float, 
         torch.stack([views[name].T_ref_camera.translation for name in names]),
         torch.stack([truth[name].translation for name in names]),
     )
-    found = [
-        pose_error(
-            bn.SE3(
-                align.T_target_source.rotation @ views[name].T_ref_camera.rotation,
-                align.apply(views[name].T_ref_camera.translation),
-            ),
-            truth[name],
-        )
-        for name in names
-    ]
+    found = [pose_error(align.move(views[name].T_ref_camera), truth[name]) for name in names]
     return max(float(e.translation) for e in found), max(float(e.rotation_deg) for e in found)
 
 
