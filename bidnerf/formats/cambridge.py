@@ -58,9 +58,9 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
         if T is None:
             raise row.error(": is no pose")
         # Lists have the position beside the rotation to the camera, those of Map-free the translation.
-        pose, lens = T.inverse() if map_free else SE3(T.rotation.mT, T.translation), lenses.get(_stem(name))
-        is_known = lens is not None and not options.camera_source.is_given
-        camera = CameraSource(_camera(*lens, image)) if lens and is_known else options.camera_source
+        pose, camera = T.inverse() if map_free else SE3(T.rotation.mT, T.translation), options.camera_source
+        if (lens := lenses.get(_stem(name))) and not camera.is_given:
+            camera = CameraSource(_camera(*lens, image))
         return Shot(image=image, camera=camera, T_world_camera=pose, splits=(split,) if split else ())
 
     names, unit = FileNames(path, path / "images", images=options.image_folder), file.suffix != ".nvm"

@@ -58,14 +58,9 @@ def _find(path: Path) -> Path | None:
 def _sensor(file: Path, options: DatasetOptions) -> tuple[CameraSource, SE3]:
     """Return the camera (given or calibrated) and T_body_camera. Raises ``InputError`` for an invalid file."""
     values = parse_yaml(read_file(file, EXPECTED_SENSOR), str(file), EXPECTED_SENSOR)
-    if not isinstance(values, dict):
-        raise InputError("has no entries", where=file, expected=EXPECTED_SENSOR)
 
     def numbers(key: str, count: int) -> list[float]:
-        """Return the numbers of a list, which may be the ``data`` of a matrix."""
-        listed = values.get(key)
-        listed = listed.get("data") if isinstance(listed, dict) else listed
-        return numbers_in(f"{file}: {key}", " ".join(map(str, listed)) if isinstance(listed, list) else "", count)
+        return numbers_in(f"{file}: {key}", values.get(key), count)
 
     T_body_camera = pose_of_matrix(file, numbers("T_BS", 16), "the rotation of T_BS")
     if options.given_camera is not None:

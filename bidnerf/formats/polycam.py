@@ -17,10 +17,12 @@ from functools import partial
 from pathlib import Path
 
 from bidnerf.formats import lidar
+from bidnerf.formats.layouts import size_of
 from bidnerf_core.datasets import (
     Capture,
     DatasetOptions,
     DepthFile,
+    FileNames,
     Format,
     Shot,
     camera_of,
@@ -28,8 +30,8 @@ from bidnerf_core.datasets import (
     warn_about,
 )
 from bidnerf_core.errors import amount
-from bidnerf_core.frames import natural_order, photos_in
-from bidnerf_core.io import is_file, read_header, read_record
+from bidnerf_core.frames import photos_in
+from bidnerf_core.io import is_file, read_record
 
 LENS_KEYS = ("fx", "fy", "cx", "cy")
 POSE_KEYS = [[f"t_{row}{column}" for column in range(4)] for row in range(3)]
@@ -44,16 +46,15 @@ def _read(path: Path, cameras: Path, options: DatasetOptions) -> Capture:
             path,
             "has no corrected_cameras, so the poses are ARKit's, which drift; Polycam can correct them on export",
         )
-    photos = {photo.stem: photo for photo in photos_in(images)[0]}
-    total = amount(len(photos), "photo")
-    read, has_depth = lidar.LidarDepth((lidar.HIGH_CONFIDENCE, 255)), (cameras.parent / "depth").is_dir()
-    shots = list[Shot]()
-    for description in sorted(cameras.glob("[!.]*.json"), key=lambda file: natural_order(file.name)):
-        record, time = read_record(description), description.stem
-        photo = photos.pop(time, images / f"{time}.jpg")
-        if not is_file(photo):
-            shots.append(Shot(image=photo))
-            continue
+    files, photos = {file.stem: file for file in cameras.glob("[!.]*.json")}, photos_in(images)[0]
+    if left := sum(photo.stem not in files for photo in photos):
+        warn_about(
+            images, f"{left} of {amount(len(photos), 'photo')} have no camera in {cameras.name} and are left out"
+        )
+    read_depth, has_depth = lidar.LidarDepth((lidar.HIGH_CONFIDENCE, 255)), (cameras.parent / "depth").is_dir()
+
+    def read(photo: Path, time: str, file: Path) -> Shot:
+        record = read_record(file)
         rows = [[record.number(key) for key in row] for row in POSE_KEYS]
         lens = [number for key in LENS_KEYS if (number := record.number(key)) is not None]
         if len(lens) < len(LENS_KEYS) or any(number is None for row in rows for number in row):
@@ -61,25 +62,21 @@ def _read(path: Path, cameras: Path, options: DatasetOptions) -> Capture:
                 "is incomplete", expected="fx, fy, cx, cy, and t_00 to t_23, the rows of the camera's pose"
             )
         width, height = record.size("width"), record.size("height")
-        if width is None or height is None:  # newer exports do not store the size
-            header = read_header(photo)
-            width, height = width or header.width, height or header.height
         depth, confidence = (cameras.parent / kind / f"{time}.png" for kind in ("depth", "confidence"))
-        measured = partial(read, depth, confidence if is_file(confidence) else None)
-        shots.append(
-            Shot(
-                image=photo,
-                camera=camera_of(str(description), lens, (width, height)),
-                T_world_camera=pose_of_rows(record, "t_00 to t_23", rows),
-                time=int(time) / 1_000_000 if time.isdecimal() else None,
-                depth=DepthFile(depth, measured) if has_depth else None,
-                border=15 if corrected else 0,  # pixels that are black in undistorted photos
-                folders=(),
-                usual_side=lidar.LARGEST_SIDE,
-            )
+        measured = partial(read_depth, depth, confidence if is_file(confidence) else None)
+        return Shot(
+            image=photo,
+            # Newer exports do not store the size.
+            camera=camera_of(str(file), lens, (width, height) if width and height else size_of(photo)),
+            T_world_camera=pose_of_rows(record, "t_00 to t_23", rows),
+            time=int(time) / 1_000_000 if time.isdecimal() else None,
+            depth=DepthFile(depth, measured) if has_depth else None,
+            border=15 if corrected else 0,  # pixels that are black in undistorted photos
+            folders=(),
+            usual_side=lidar.LARGEST_SIDE,
         )
-    if photos:
-        warn_about(images, f"{len(photos)} of {total} have no camera in {cameras.name} and are left out")
+
+    shots = FileNames(images).shots(files, read)
     return Capture(path, shots, options.colour, unit="metres", up=lidar.UP, pose_file=cameras)
 
 

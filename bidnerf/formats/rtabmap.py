@@ -63,11 +63,10 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
 def _local_transform(calibration: Path) -> SE3 | None:
     """Return ``T_robot_camera``, or None if the calibration does not state it."""
     values = parse_yaml(read_file(calibration, "a calibration"), str(calibration), "a calibration")
-    found = values.get("local_transform") if isinstance(values, dict) else None
-    if not isinstance(found, dict) or not isinstance(found.get("data"), list):
+    if (transform := values.get("local_transform")) is None:
         return None
     where = f"{calibration}: local_transform"
-    return pose_of_matrix(where, numbers_in(where, " ".join(map(str, found["data"])), 12))
+    return pose_of_matrix(where, numbers_in(where, transform, 12))
 
 
 reader = Format(

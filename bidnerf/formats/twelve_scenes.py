@@ -17,11 +17,11 @@ from pathlib import Path
 
 from bidnerf.formats.seven_scenes import LAYOUT as SEVEN_SCENES
 from bidnerf_core.camera import CameraSource, Intrinsics
-from bidnerf_core.datasets import Capture, DatasetOptions, Format, Shot, camera_of, first_file, numbers_in, pixel_size
+from bidnerf_core.datasets import Capture, DatasetOptions, Format, camera_of, first_file, numbers_in, pixel_size
 from bidnerf_core.depth import MILLIMETRE, DepthCamera
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import read_rows
+from bidnerf_core.io import read_file, read_rows
 
 LAYOUT = replace(
     SEVEN_SCENES, folders=(("data",), (".",)), camera=("../info.txt", "../_info.txt", "info.txt", "_info.txt")
@@ -41,9 +41,20 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
         raise InputError("no m_calibrationColorIntrinsic", where=info, expected=expected)
     unit, sensor = options.depth_unit or MILLIMETRE, options.sensor(path, own_sensor(colour, depth))
     shots = LAYOUT.shots(images, CameraSource(options.given_camera or colour), unit, sensor)
+    if (file := first_file(path, "split.txt", "../split.txt")) is not None:
+        text = read_file(file, "a list of sequences").decode("utf-8", "replace")
+        first = re.search(r"start\s*=\s*(\d+)\s*;\s*end\s*=\s*(\d+)", text)
+        if first is None:
+            raise InputError("has no [start=0 ; end=356]", where=file, expected="the frames of each sequence")
+        start, end = numbers_in(file, f"{first[1]} {first[2]}", 2)
+        in_first = [start <= float(shot.stem.partition("-")[2]) <= end for shot in shots]
+        shots = [
+            replace(shot, splits=("test" if is_test else "train",)) if shot.T_world_camera else shot
+            for shot, is_test in zip(shots, in_first, strict=True)
+        ]
     return Capture(
         path,
-        _in_splits(path, shots),
+        shots,
         options.colour,
         unit="metres",
         depth_unit=unit,
@@ -66,25 +77,6 @@ def _camera(info: Path, values: dict[str, list[float]], kind: str) -> Intrinsics
     row = 4 if len(matrix) == 16 else 3
     numbers = matrix[0], matrix[row + 1], matrix[2], matrix[row + 2]
     return camera_of(info, numbers, pixel_size(info, [size[0][0], size[1][0]]))
-
-
-def _in_splits(path: Path, shots: list[Shot]) -> list[Shot]:
-    """Assign the frames of the first sequence to "test" and all other frames to "train"."""
-    file = first_file(path, "split.txt", "../split.txt")
-    if file is None:
-        return shots
-    rows = read_rows(file, "a list of sequences", "start and end")
-    ranges = (re.search(r"start\s*=\s*(\d+)\s*;\s*end\s*=\s*(\d+)", row.text) for row in rows)
-    first = next((found for found in ranges if found is not None), None)
-    if first is None:
-        raise InputError("has no [start=0 ; end=356]", where=file, expected="the frames of each sequence")
-    start, end = numbers_in(file, f"{first[1]} {first[2]}", 2)
-    return [
-        replace(shot, splits=("test" if start <= float(shot.stem.partition("-")[2]) <= end else "train",))
-        if shot.T_world_camera
-        else shot
-        for shot in shots
-    ]
 
 
 reader = Format(

@@ -203,10 +203,7 @@ def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> 
     if start[:1] in (b"{", b"["):
         return _json_camera(parse_record(str(path), content), size)
     if start.startswith((b"%YAML", b"---")) or path.suffix.lower() in (".yaml", ".yml"):
-        values = parse_yaml(content, str(path), EXPECTED_YAML)
-        if not isinstance(values, Mapping):
-            raise InputError(where=path, expected=EXPECTED_YAML)
-        return parse_calibration(str(path), values, size)
+        return parse_calibration(str(path), parse_yaml(content, str(path), EXPECTED_YAML), size)
     if start[:1] == b"<":
         return _xml_camera(path, content, size)
     rows = parse_rows(content, path, CAMERA_FORMATS, "CAMERA_ID MODEL WIDTH HEIGHT and parameters")

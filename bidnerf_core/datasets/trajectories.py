@@ -15,7 +15,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -257,19 +257,21 @@ def pose_of_numbers(where: str, numbers: Sequence[float], opengl: bool) -> SE3 |
     return SE3(rotation, torch.tensor(found[:3], dtype=torch.float64))
 
 
-def numbers_in(where: object, text: str, count: int) -> list[float]:
-    """Return the numbers in a text, separated by spaces or commas.
+def numbers_in(where: object, given: object, count: int) -> list[float]:
+    """Return the numbers in a text, separated by spaces or commas, in a list, or in the ``data`` of a matrix in YAML.
 
     Raises ``InputError`` unless there are ``count`` of them, all finite.
     """
+    listed = given.get("data") if isinstance(given, Mapping) else given
+    words = listed.replace(",", " ").split() if isinstance(listed, str) else listed if isinstance(listed, list) else []
     try:
-        numbers = [float(word) for word in text.replace(",", " ").split()]
-    except ValueError as error:
+        numbers = [float(word) for word in words]
+    except (TypeError, ValueError) as error:
         raise InputError(error, where=where, expected=f"{count} numbers") from error
     if len(numbers) != count:
         raise InputError(f"has {len(numbers)} numbers", where=where, expected=f"{count}")
     if not all(map(math.isfinite, numbers)):
-        raise InputError(f"{text.strip()[:60]!r} is not finite", where=where, expected=f"{count} numbers")
+        raise InputError(f"{' '.join(words)[:60]!r} is not finite", where=where, expected=f"{count} numbers")
     return numbers
 
 

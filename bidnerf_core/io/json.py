@@ -334,10 +334,11 @@ def expected_kinds(errors: Sequence[Any]) -> str:
     return " or ".join(dict.fromkeys(texts))
 
 
-def parse_yaml(content: bytes, where: str, expected: str) -> Any:
-    """Return the first document of a YAML text, with all values, including numbers, as text. Tags, which may run code, are ignored.
+def parse_yaml(content: bytes, where: str, expected: str) -> dict[str, Any]:
+    """Return the first document of a YAML text, a mapping, with all values, including numbers, as text. Tags, which may run code, are ignored.
 
-    Raises ``InputError``, whose message begins with ``where``, if the text is malformed, too large or too deep, or has aliases.
+    Raises ``InputError``, whose message begins with ``where``, if the text is malformed, too large or too deep, has aliases, or
+    is no mapping.
     """
     import yaml  # imported here, since few commands read YAML
 
@@ -353,9 +354,12 @@ def parse_yaml(content: bytes, where: str, expected: str) -> Any:
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if isinstance(event, yaml.AliasEvent) or depth > deepest:
                 raise yaml.YAMLError(f"aliases, or more than {deepest} lists and mappings within each other")
-        return next(iter(yaml.load_all(text, Loader=loader)), None)
+        found = next(iter(yaml.load_all(text, Loader=loader)), None)
     except (UnicodeDecodeError, yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         raise InputError(f"is not YAML ({reason(error)})", where=where, expected=expected) from error
+    if not isinstance(found, dict):
+        raise InputError("has no entries", where=where, expected=expected)
+    return found
 
 
 def parse_xml(content: bytes, where: str, expected: str) -> Element:
