@@ -15,7 +15,6 @@ from __future__ import annotations
 from pathlib import Path, PurePosixPath
 from typing import TypeAlias
 
-from bidnerf.formats.layouts import size_of
 from bidnerf.formats.reality_capture import file_heads
 from bidnerf_core.camera import CameraSource, Intrinsics
 from bidnerf_core.datasets import (
@@ -30,7 +29,7 @@ from bidnerf_core.datasets import (
 )
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import Row, is_file, read_rows
+from bidnerf_core.io import Row, is_file, read_header, read_rows
 
 LISTS = {"train": "dataset_train.txt", "test": "dataset_test.txt"}
 Listed: TypeAlias = tuple[Row, list[float]]
@@ -98,7 +97,7 @@ def _stem(name: str) -> str:
 def _camera(row: Row, numbers: list[float], image: Path) -> Intrinsics:
     if len(numbers) == 6:
         return camera_of(row.where, numbers[:4], (round(numbers[4]), round(numbers[5])), first_centre=0)
-    size, focal, r = size_of(image), numbers[0], numbers[8]
+    size, focal, r = read_header(image).size, numbers[0], numbers[8]
     lens = (-r, 3 * r * r, 0.0, 0.0, -12 * r**3)
     return camera_of(row.where, (focal, focal, size[0] / 2, size[1] / 2), size, lens, first_centre=0)
 

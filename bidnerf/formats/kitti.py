@@ -15,7 +15,7 @@ from pathlib import Path
 
 import torch
 
-from bidnerf.formats.layouts import Layout, size_of
+from bidnerf.formats.layouts import Layout
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import (
     Capture,
@@ -28,7 +28,7 @@ from bidnerf_core.datasets import (
 )
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import is_file, read_rows
+from bidnerf_core.io import is_file, read_header, read_rows
 
 LAYOUT = Layout(
     tuple((f"image_{number}",) for number in (2, 0, 3, 1)),  # the left colour camera first
@@ -40,7 +40,7 @@ LAYOUT = Layout(
 def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
     """Read the lists. Raises ``InputError`` if one is invalid."""
     number, sequence, stamps = images[0].parent.name.removeprefix("image_"), path.resolve(), path / "times.txt"
-    camera, T_first_camera = _calibration(path / "calib.txt", f"P{number}", size_of(images[0]))
+    camera, T_first_camera = _calibration(path / "calib.txt", f"P{number}", read_header(images[0]).size)
     name = f"{sequence.name}.txt"
     file = first_file(path, "poses.txt", name, f"{sequence.parent.parent}/poses/{name}")
     poses = [] if file is None else [T @ T_first_camera for T in read_matrices(file)]

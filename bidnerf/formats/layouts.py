@@ -76,7 +76,9 @@ class Layout:
                 Shot(
                     image=image,
                     stem=name,
-                    camera=camera if isinstance(camera, Camera | CameraSource) else camera(file, size_of(image)),
+                    camera=camera
+                    if isinstance(camera, Camera | CameraSource)
+                    else camera(file, read_header(image).size),
                     T_world_camera=read_pose_matrix(pose) if poses is None else poses.get(name),
                     depth=DepthFile(depth, partial(read_depth, depth, unit), sensor) if is_file(depth) else None,
                 )
@@ -95,9 +97,3 @@ class Layout:
         own, prefix = self._name(image), image.parent.name.removesuffix("rgb")
         number = own[len(own.rstrip("0123456789")) :]
         return Path(os.path.normpath(image.parent / name.format(name=own, number=number, prefix=prefix)))
-
-
-def size_of(image: Path) -> tuple[int, int]:
-    """Return the width and height of an image file."""
-    header = read_header(image)
-    return header.width, header.height

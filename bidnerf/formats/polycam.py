@@ -17,7 +17,6 @@ from functools import partial
 from pathlib import Path
 
 from bidnerf.formats import lidar
-from bidnerf.formats.layouts import size_of
 from bidnerf_core.datasets import (
     Capture,
     DatasetOptions,
@@ -31,7 +30,7 @@ from bidnerf_core.datasets import (
 )
 from bidnerf_core.errors import amount
 from bidnerf_core.frames import photos_in
-from bidnerf_core.io import is_file, read_record
+from bidnerf_core.io import is_file, read_header, read_record
 
 LENS_KEYS = ("fx", "fy", "cx", "cy")
 POSE_KEYS = [[f"t_{row}{column}" for column in range(4)] for row in range(3)]
@@ -67,7 +66,7 @@ def _read(path: Path, cameras: Path, options: DatasetOptions) -> Capture:
         return Shot(
             image=photo,
             # Newer exports do not store the size.
-            camera=camera_of(str(file), lens, (width, height) if width and height else size_of(photo)),
+            camera=camera_of(str(file), lens, (width, height) if width and height else read_header(photo).size),
             T_world_camera=pose_of_rows(record, "t_00 to t_23", rows),
             time=int(time) / 1_000_000 if time.isdecimal() else None,
             depth=DepthFile(depth, measured) if has_depth else None,

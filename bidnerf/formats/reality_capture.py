@@ -17,7 +17,6 @@ from pathlib import Path
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidnerf.formats.layouts import size_of
 from bidnerf_core.datasets import (
     Capture,
     DatasetOptions,
@@ -30,7 +29,7 @@ from bidnerf_core.datasets import (
 )
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import Row, open_binary
+from bidnerf_core.io import Row, open_binary, read_header
 
 POSE_FIELDS = ("x", "y", "alt", "heading", "pitch", "roll")
 
@@ -70,7 +69,7 @@ def _shot(image: Path, name: str, listed: tuple[Row, dict[str, str]]) -> Shot:
     pose = SE3(turn * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64), position)
     if number("k4") != 0:
         raise row.error(": k4 is not 0, which OpenCV's model does not support; export undistorted images instead")
-    size = width, height = size_of(image)
+    size = width, height = read_header(image).size
     focal = number("f") * max(size) / 36.0  # focal lengths refer to a film 36 mm wide
     centre = width / 2 + number("px") * max(size), height / 2 + number("py") * max(size)
     lens = [number(key) for key in ("k1", "k2", "t1", "t2", "k3")]

@@ -12,11 +12,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from bidnerf.formats.ace import read_matrix
-from bidnerf.formats.layouts import Layout, size_of
+from bidnerf.formats.layouts import Layout
 from bidnerf.formats.twelve_scenes import own_sensor
 from bidnerf_core.datasets import Capture, DatasetOptions, Format
 from bidnerf_core.depth import MILLIMETRE
-from bidnerf_core.io import is_file
+from bidnerf_core.io import is_file, read_header
 
 LAYOUT = Layout(
     (("color",), ("rgb",)),
@@ -30,8 +30,8 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
     """Read the cameras and poses. Raises ``InputError`` if one is invalid."""
     calibration, depths = LAYOUT.file(LAYOUT.camera, images[0]), [LAYOUT.file(LAYOUT.depth, image) for image in images]
     of_depth, first = calibration.with_name("intrinsic_depth.txt"), next(filter(is_file, depths), None)
-    camera = read_matrix(calibration, size_of(images[0]))
-    depth_camera = read_matrix(of_depth, size_of(first)) if first is not None and is_file(of_depth) else None
+    camera = read_matrix(calibration, read_header(images[0]).size)
+    depth_camera = read_matrix(of_depth, read_header(first).size) if first is not None and is_file(of_depth) else None
     sensor, unit = options.sensor(path, own_sensor(camera, depth_camera)), options.depth_unit or MILLIMETRE
     shots = LAYOUT.shots(images, camera, unit, sensor)
     return Capture(

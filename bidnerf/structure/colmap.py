@@ -18,7 +18,6 @@ from typing import Any, TypeAlias
 import numpy as np
 import torch
 
-from bidnerf.structure.sources import SourceImage
 from bidnerf_core.camera import (
     UPRIGHT,
     Camera,
@@ -31,6 +30,7 @@ from bidnerf_core.camera import (
     read_exif,
     reduced_size,
 )
+from bidnerf_core.datasets import Capture, Shot
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.io import read_header, read_image
 from bidnerf_core.mapping import Keypoints, Sift, Vocabulary
@@ -78,7 +78,8 @@ def import_pycolmap(what: str) -> Any:
 class ListedPhoto:
     """A readable photo: its size as stored, the size at which keypoints are detected, and the number of its camera."""
 
-    image: SourceImage
+    shot: Shot
+    file: Path
     number: int  # in the database, from 1
     size: tuple[int, int]  # width and height as stored
     reduced: tuple[int, int]
@@ -109,33 +110,35 @@ class PhotoSet:
             )
 
 
-def list_photos(images: Sequence[SourceImage], given: Camera | CameraSource | str | Path | None) -> PhotoSet:
+def list_photos(images: Capture, given: Camera | CameraSource | str | Path | None) -> PhotoSet:
     """Read the headers of photos, and group the photos by camera.
 
     Raises ``InputError`` for a ``given`` camera that does not fit the photos.
     """
     listed, numbers = PhotoSet(), dict[Any, int]()
-    for number, image in enumerate(images, start=1):
+    for number, shot in enumerate(images.shots, start=1):
+        file = Path(str(shot.image))
         try:
-            header, exif = read_header(image.file), read_exif(image.file)
+            size, exif = read_header(file).size, read_exif(file)
         except InputError as error:
-            listed.unusable[image.name] = _without_file(error, image)
+            listed.unusable[shot.name] = _without_file(error, file)
             continue
-        size, exif_of_lens = (header.width, header.height), replace(exif, orientation=UPRIGHT)
-        camera = numbers.setdefault((size, exif_of_lens, image.camera), len(numbers) + 1)
-        photo = ListedPhoto(image, number, size, reduced_size(*size, MATCHED_SIDE), exif, camera)
+        exif_of_lens = replace(exif, orientation=UPRIGHT)
+        camera = numbers.setdefault((size, exif_of_lens, shot.camera), len(numbers) + 1)
+        photo = ListedPhoto(shot, file, number, size, reduced_size(*size, MATCHED_SIDE), exif, camera)
         listed.photos.append(photo)
         if camera in listed.cameras:
             continue
         first: Camera = Intrinsics.from_focal(1.2 * max(size), *size)  # as COLMAP assumes
-        source = image.camera if given is None else given if isinstance(given, CameraSource) else CameraSource(given)
+        own = shot.camera if given is None else given
+        source = own if isinstance(own, CameraSource) else CameraSource(own)
         if source.is_given:
-            first = source.find(image.file, Raster(*size)).camera
+            first = source.find(file, Raster(*size)).camera
             listed.fixed.add(camera)
             listed.known_focal.add(camera)
         elif exif.has_focal_length:
             with contextlib.suppress(InputError):  # cropped after it was taken
-                first = camera_from_exif(str(image.file), Raster(*size), exif_of_lens).intrinsics
+                first = camera_from_exif(str(file), Raster(*size), exif_of_lens).intrinsics
                 listed.known_focal.add(camera)
         listed.cameras[camera] = first.resized(*photo.reduced)
     return listed
@@ -192,7 +195,7 @@ def write_keypoints(database: Any, photos: PhotoSet, pycolmap: Any) -> None:
         try:
             for done, (photo, keypoints) in enumerate(zip(missing, pool.map(_keypoints, missing), strict=True)):
                 if isinstance(keypoints, InputError):
-                    photos.unusable[photo.image.name] = _without_file(keypoints, photo.image)
+                    photos.unusable[photo.shot.name] = _without_file(keypoints, photo.file)
                     photos.photos.remove(photo)
                 else:
                     descriptors = pycolmap.FeatureDescriptors(
@@ -209,7 +212,7 @@ def write_keypoints(database: Any, photos: PhotoSet, pycolmap: Any) -> None:
 def _keypoints(photo: ListedPhoto) -> Keypoints | InputError:
     """Return the keypoints of the downscaled photo, without those on its transparent background, or the error."""
     try:
-        rgb, alpha = read_image(photo.image.file, size=photo.reduced)
+        rgb, alpha = read_image(photo.file, size=photo.reduced)
     except InputError as error:
         return error
     keypoints = DETECTOR(rgb)
@@ -220,9 +223,9 @@ def _keypoints(photo: ListedPhoto) -> Keypoints | InputError:
     return keypoints[inside]
 
 
-def _without_file(error: InputError, image: SourceImage) -> str:
+def _without_file(error: InputError, file: Path) -> str:
     """Return an error's message without the leading file path, which is shown next to the message anyway."""
-    return str(error).removeprefix(f"{image.file}: ")
+    return str(error).removeprefix(f"{file}: ")
 
 
 def similar_pairs(descriptors: Sequence[np.ndarray]) -> Pairs:

@@ -7,7 +7,8 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -90,16 +91,13 @@ def _upright_axes(photo: ListedPhoto) -> tuple[np.ndarray, np.ndarray]:
 
 def restore_size(model: Any, photos: Mapping[int, ListedPhoto]) -> None:
     """Scale the cameras and keypoints of a model from the downscaled photos to the photos as stored."""
-    sizes = {photo.camera: photo for photo in photos.values()}
-    for number, photo in sizes.items():
-        if model.exists_camera(number):
-            model.camera(number).rescale(*photo.size)
+    for camera, photo in {photo.camera: photo for photo in photos.values()}.items():
+        if model.exists_camera(camera):
+            model.camera(camera).rescale(*photo.size)
     for number in model.reg_image_ids():
-        photo = photos[number]
-        scale = np.array(photo.size) / np.array(photo.reduced)
-        if (scale != 1).any():
-            for point in model.image(number).points2D:
-                point.xy = point.xy * scale
+        scale = np.array(photos[number].size) / np.array(photos[number].reduced)
+        for point in model.image(number).points2D if (scale != 1).any() else ():
+            point.xy = point.xy * scale
 
 
 def count_contradictions(model: Any, database: Any, pycolmap: Any) -> tuple[int, int]:
@@ -112,26 +110,33 @@ def count_contradictions(model: Any, database: Any, pycolmap: Any) -> tuple[int,
     repeated details have up to 80), and how many of these pairs contradict the model: fewer than half of their matches are within
     four pixels of the epipolar lines, measured in the downscaled photos.
     """
-    registered, keypoints = set(model.reg_image_ids()), dict[int, np.ndarray]()
-    pairs = contradicting = 0
-    for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
-        i, j = pycolmap.pair_id_to_image_pair(pair)
-        if not {i, j} <= registered or len(geometry.inlier_matches) < 100:
+    registered, pairs, contradicting = set(model.reg_image_ids()), 0, 0
+    for (i, j), ends in _matched_keypoints(database, 100, pycolmap):
+        if not {i, j} <= registered:
             continue
-        rays = []
-        for number, column in ((i, 0), (j, 1)):
-            if number not in keypoints:
-                keypoints[number] = database.read_keypoints(number)[:, :2].astype(np.float64)
-            camera = model.camera(model.image(number).camera_id)
-            seen = camera.cam_from_img(keypoints[number][geometry.inlier_matches[:, column]])
-            rays.append(np.column_stack([seen, np.ones(len(seen))]))
+        cameras = [model.camera(model.image(number).camera_id) for number in (i, j)]
+        rays = [
+            np.column_stack([camera.cam_from_img(seen), np.ones(len(seen))])
+            for camera, seen in zip(cameras, ends, strict=True)
+        ]
         T = (model.image(j).cam_from_world() * model.image(i).cam_from_world().inverse()).matrix()
         t = T[:, 3] / max(np.linalg.norm(T[:, 3]), 1e-12)
         lines = np.cross(t, rays[0] @ T[:, :3].T)
         away = np.abs((lines * rays[1]).sum(-1)) / np.linalg.norm(lines[:, :2], axis=-1).clip(1e-12)
         pairs += 1
-        contradicting += int(np.mean(away * camera.mean_focal_length() < 4) < 0.5)
+        contradicting += int(np.mean(away * cameras[1].mean_focal_length() < 4) < 0.5)
     return pairs, contradicting
+
+
+def _matched_keypoints(
+    database: Any, least: int, pycolmap: Any
+) -> Iterator[tuple[tuple[int, int], tuple[np.ndarray, np.ndarray]]]:
+    """Yield the numbers of two photos with at least ``least`` verified matches, and the matched keypoints (n, 2) of each."""
+    read = cache(lambda number: database.read_keypoints(number)[:, :2].astype(np.float64))
+    for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
+        (i, j), matches = pycolmap.pair_id_to_image_pair(pair), geometry.inlier_matches
+        if len(matches) >= least:
+            yield (i, j), (read(i)[matches[:, 0]], read(j)[matches[:, 1]])
 
 
 def require_parallax(model: Any, database: Any, photos: PhotoSet, source: Path, pycolmap: Any) -> None:
@@ -149,16 +154,12 @@ def require_parallax(model: Any, database: Any, photos: PhotoSet, source: Path, 
                 expected="their camera, such as a fisheye lens; or pinhole views cut from panoramas",
             )
     by_number, pairs = {photo.number: photo for photo in photos.photos}, list[np.ndarray]()
-    for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
-        numbers, matches = pycolmap.pair_id_to_image_pair(pair), geometry.inlier_matches
-        if len(matches) >= 30 and not {by_number[n].camera for n in numbers if n in by_number} & photos.fixed:
-            ends = []
-            for number, column in zip(numbers, (0, 1), strict=True):
-                size = np.array(by_number[number].reduced)
-                seen = database.read_keypoints(number)[matches[:, column], :2].astype(np.float64)
-                ends.append((seen - size / 2) / size.max())
+    for numbers, seen in _matched_keypoints(database, 30, pycolmap):
+        if not {by_number[n].camera for n in numbers if n in by_number} & photos.fixed:
+            sizes = [np.array(by_number[number].reduced) for number in numbers]
+            ends = np.stack([(pixels - size / 2) / size.max() for pixels, size in zip(seen, sizes, strict=True)])
             if np.median(np.linalg.norm(ends[1] - ends[0], axis=-1)) > 0.03:  # of the longer side
-                pairs.append(np.stack(ends))
+                pairs.append(ends)
     pairs = pairs[:: max(1, len(pairs) // 40)]
     side = max(max(photo.reduced) for photo in photos.photos)
     lenses = itertools.product(
@@ -202,7 +203,7 @@ def reasons_left_out(
         if model is not None:
             size = amount(model.num_reg_images(), "photo")
             reason = f"belongs to another model, with {size}, that has no connection to the largest"
-        reasons[photo.image.name] = reason
+        reasons[photo.shot.name] = reason
     return reasons
 
 
@@ -214,10 +215,10 @@ def scale_to_depth(model: Any, photos: Mapping[int, ListedPhoto], pycolmap: Any)
     ratios = list[float]()
     for number in model.reg_image_ids():
         image, photo = model.image(number), photos[number]
-        if photo.image.depth is None or photo.image.depth.sensor is not None:
+        depth = photo.shot.depth
+        if depth is None or depth.sensor is not None:
             continue
-        where = f"{photo.image.depth.path}: depth"
-        metres = fit_depth(photo.image.depth.read(), Raster(*photo.size), photo.reduced, where).numpy()
+        metres = fit_depth(depth.read(), Raster(*photo.size), photo.reduced, f"{depth.path}: depth").numpy()
         for point in (point for point in image.points2D if point.has_point3D()):
             column, row = np.clip(point.xy.astype(int), 0, np.array(photo.reduced) - 1)
             far = (image.cam_from_world() * model.point3D(point.point3D_id).xyz)[2]
@@ -230,23 +231,28 @@ def scale_to_depth(model: Any, photos: Mapping[int, ListedPhoto], pycolmap: Any)
 
 
 def write_dataset(
-    folder: Path, photos: Mapping[int, ListedPhoto], model: Any, base: Path, unit: LengthUnit | Literal["units"]
+    folder: Path,
+    photos: Mapping[int, ListedPhoto],
+    model: Any,
+    base: Path,
+    unit: LengthUnit | Literal["units"],
+    depth_unit: float | None,
 ) -> None:
-    """Write a model of ``photos`` (by number) and its ``transforms.json`` to ``folder``; the model names images relative to ``base``."""
+    """Write a model of ``photos`` (by number) and its ``transforms.json`` to ``folder``; the model names images relative to ``base``.
+
+    ``depth_unit`` is the length of a step of depth images (metres), if there are any.
+    """
     entries = []
     for number in sorted(model.reg_image_ids()):
         photo, image = photos[number], model.image(number)
-        image.name = relative_path(photo.image.file, base)
+        image.name = relative_path(photo.file, base)
         camera = from_colmap(model.camera(image.camera_id))
         matrix = torch.from_numpy(image.cam_from_world().matrix()).double()
         T_world_camera = SE3(matrix[:, :3].clone(), matrix[:, 3].clone()).inverse()
-        path = relative_path(photo.image.file, folder)
-        entry, depth = frame_entry(path, photo.image.name, camera, T_world_camera, photo.image.time), photo.image.depth
-        if depth is not None and depth.sensor is None and isinstance(depth.path, Path) and photo.image.depth_unit:
-            entry |= {
-                "depth_file_path": relative_path(depth.path, folder),
-                "depth_unit_scale_factor": photo.image.depth_unit,
-            }
+        path, depth = relative_path(photo.file, folder), photo.shot.depth
+        entry = frame_entry(path, photo.shot.name, camera, T_world_camera, photo.shot.time)
+        if depth is not None and depth.sensor is None and isinstance(depth.path, Path) and depth_unit:
+            entry |= {"depth_file_path": relative_path(depth.path, folder), "depth_unit_scale_factor": depth_unit}
         entries.append(entry)
     (folder / MODEL).mkdir(parents=True, exist_ok=True)
     model.write_binary(folder / MODEL)

@@ -47,16 +47,14 @@ from bidnerf.structure.record import (
     remove_output,
 )
 from bidnerf.structure.sources import (
-    Frames,
-    SourceImage,
     choose_frames,
     measure_frames,
     photos_of,
-    recorded_frames,
     refuse_panoramas,
     write_frames,
 )
 from bidnerf_core.camera import UPRIGHT, Camera, CameraSource
+from bidnerf_core.datasets import Capture
 from bidnerf_core.errors import Cancelled, InputError, InputWarning, amount
 from bidnerf_core.io import output_folder, to_plain, write_file
 from bidnerf_core.progress import Cancel, ProgressCallback, job_context
@@ -93,9 +91,9 @@ def find_poses(
     """
     source, folder = Path(photos), Path(out)
     pycolmap = import_pycolmap(str(source))
-    frames = recorded_frames(source, camera) if source.exists() else None
-    images = photos_of(source, folder, camera) if frames is None else []
-    inputs = digest([image.file for image in images] or [source], camera)
+    images = photos_of(source, folder, camera)
+    files = [shot.file for shot in images.shots if shot.file is not None]
+    inputs = digest(files or [source], camera)
     if reuse or not overwrite:
         with contextlib.suppress(*([InputError] if overwrite else [])):  # a damaged record is replaced
             record = read_pose_record(folder)
@@ -115,9 +113,9 @@ def find_poses(
     ):
         if overwrite and not reuse:
             remove_output(folder)
-        work = open_work(folder, inputs, video=not images)
+        work = open_work(folder, inputs, video=not files)
         try:
-            record = _search(source, frames or images, work, inputs, camera, pycolmap)
+            record = _search(source, images, work, inputs, camera, pycolmap)
         except Cancelled as stopped:
             raise Cancelled(f"{folder}: {stopped}; the same command resumes from there") from stopped
         except InputError:
@@ -134,18 +132,18 @@ def find_poses(
 
 def _search(
     source: Path,
-    images: list[SourceImage] | Frames,
+    images: Capture,
     work: Path,
     inputs: str,
     camera: Camera | CameraSource | str | Path | None,
     pycolmap: Any,
 ) -> FoundPoses:
     """Find the poses of the images of ``source``, or of frames chosen from a recording; write the dataset next to ``work``."""
-    start, folder, database, video = time.monotonic(), work.parent, work / "database.db", not isinstance(images, list)
+    start, folder, database, video = time.monotonic(), work.parent, work / "database.db", images.shots[0].file is None
     threads = max(1, torch.get_num_threads())
-    if not isinstance(images, list):
+    if video:
         images = write_frames(images, folder / FRAMES, choose_frames(measure_frames(images)))
-    refuse_panoramas(images)
+    refuse_panoramas([shot.file for shot in images.shots if shot.file is not None])
     photos = list_photos(images, camera)
     try:
         stored = pycolmap.Database.open(database)
@@ -186,12 +184,13 @@ def _search(
     metric = scale_to_depth(model, by_number, pycolmap)
     turn_upright(model, by_number, pycolmap)
     restore_size(model, by_number)
-    write_dataset(folder, by_number, model, folder / FRAMES if video else source, "metres" if metric else "units")
+    base: Path = folder / FRAMES if video else source
+    write_dataset(folder, by_number, model, base, "metres" if metric else "units", images.depth_unit)
     reasons = reasons_left_out(photos, models, Counter(itertools.chain(*overlapping)), keypoints)
     left_out = [
-        LeftOut(image.name, relative_path(image.file, folder), reasons[image.name])
-        for image in images
-        if image.name in reasons
+        LeftOut(shot.name, relative_path(Path(str(shot.image)), folder), reasons[shot.name])
+        for shot in images.shots
+        if shot.name in reasons
     ]
     turned = sum(by_number[number].exif.orientation != UPRIGHT for number in model.reg_image_ids())
     return FoundPoses(

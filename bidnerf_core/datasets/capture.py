@@ -125,8 +125,7 @@ class Shot:
         assert self.image is not None  # otherwise, a subclass reads the image
         pixels = None
         if isinstance(self.image, ImageSource):
-            header = read_header(self.image)
-            raster = Raster(header.width, header.height)
+            raster = Raster(*read_header(self.image).size)
         else:
             pixels = self.image.pixels()
             raster = Raster(pixels.shape[1], pixels.shape[0])
@@ -177,8 +176,7 @@ def _hidden(mask: MaskFile, frame: Frame) -> Bool[Tensor, "h w"] | None:
     """Return the pixels of a frame that a mask hides. A mask of the stored image is undistorted or cropped like the image."""
     lens: Lens | None = frame.lens
     if isinstance(lens, PanoramaFace):
-        header = read_header(mask.path)
-        lens = lens if same_aspect((header.width, header.height), lens.stored_size) else None
+        lens = lens if same_aspect(read_header(mask.path).size, lens.stored_size) else None
     camera = frame.intrinsics if lens is None else lens
     size, orientation = (camera.width, camera.height), frame.orientation
     stored = orientation.upright_size(*size)  # exchanging the sides twice restores them

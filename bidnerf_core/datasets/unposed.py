@@ -162,8 +162,8 @@ def _without_copies(folder: Path, photos: Sequence[Path]) -> list[Path]:
         groups[photo.parent].append(photo)
     for below, group in groups.items():
         with contextlib.suppress(InputError):  # raised again when that photo is read
-            header = read_header(group[0])
-            alike[below.parent, frozenset(photo.stem for photo in group)].append((header.width, header.height, below))
+            size = read_header(group[0]).size
+            alike[below.parent, frozenset(photo.stem for photo in group)].append((*size, below))
     smaller = set[Path]()
     for sized in alike.values():
         largest, height_of_largest, _ = max(sized)

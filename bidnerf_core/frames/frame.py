@@ -194,8 +194,8 @@ class Frame:
         transparent pixels, by default that of the map in which the frame is localized.
         """
         path, behind = Path(path), BLACK if background is None else background_colour(background)
-        header, exif = read_header(path), read_exif(path)
-        raster = Raster(header.width, header.height, exif.orientation)
+        exif = read_exif(path)
+        raster = Raster(*read_header(path).size, exif.orientation)
         resolved = camera.find(path, raster, exif).at_most(largest)
         measured = None if depth is None else read_depth_image(Path(depth), depth_unit)
         size = (resolved.camera.width, resolved.camera.height)

@@ -59,6 +59,11 @@ class ImageHeader:
     has_alpha: bool
     deep_grey: bool = False  # one channel of more than 8 bits, as in depth images
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.width, self.height
+
 
 def read_header(path: ImageSource) -> ImageHeader:
     """Read the size of an image and what its channels are, but no pixels. Raises ``InputError`` as ``open_image`` does."""

@@ -14,7 +14,12 @@ from PIL import Image
 from bidnerf.structure import photos_of, refuse_panoramas
 from bidnerf_core.datasets import lacks_poses
 from bidnerf_core.errors import InputWarning
+from optional import require
 from refusals import refused
+
+
+def files(folder: Path) -> list[Path]:
+    return [require(shot.file) for shot in photos_of(folder).shots]
 
 
 def test_smaller_copies_of_photos_are_left_out(tmp_path: Path) -> None:
@@ -26,14 +31,14 @@ def test_smaller_copies_of_photos_are_left_out(tmp_path: Path) -> None:
             image.resize(size).save(tmp_path / folder / f"{number}.png")
     with pytest.warns(InputWarning, match="images_2 and images_4: smaller copies"):
         found = photos_of(tmp_path)
-    assert {image.file.parent.name for image in found} == {"images", "right"}  # two cameras of a rig
+    assert {require(shot.file).parent.name for shot in found.shots} == {"images", "right"}  # two cameras of a rig
 
 
 def test_panoramas_are_not_taken_for_pinhole_images(tmp_path: Path) -> None:
     image = Image.fromarray(np.zeros((20, 40, 3), np.uint8))
     image.save(tmp_path / "1.jpg", xmp=b'<x:xmpmeta GPano:ProjectionType="equirectangular"/>')
     image.save(tmp_path / "0.jpg")
-    photos = photos_of(tmp_path)
+    photos = files(tmp_path)
     (tmp_path / "0.jpg").unlink()  # a photo that cannot be read is left out later
     with refused(where=tmp_path / "1.jpg", found="is a panorama", expected="EQUIRECTANGULAR"):
         refuse_panoramas(photos)
@@ -83,7 +88,7 @@ def test_what_lies_beside_photos_is_no_photo_and_is_named(tmp_path: Path, names:
         warnings.simplefilter("always")
         assert lacks_poses(tmp_path)
         found = photos_of(tmp_path)
-    assert [image.file.name for image in found] == ["1.jpg"]
+    assert [require(shot.file).name for shot in found.shots] == ["1.jpg"]
     texts = [str(warning.message) for warning in caught]
     assert len(texts) == (remark is not None)
     assert all(text.startswith(f"{tmp_path}: {remark}") for text in texts)
@@ -95,8 +100,8 @@ def test_pictures_whose_edges_continue_each_other_are_panoramas_without_xmp(tmp_
         joined = 128 + 100 * np.sin(columns + number)[None].repeat(60, 0)[..., None].repeat(3, 2)
         Image.fromarray(joined.astype(np.uint8)).save(tmp_path / f"{number}.png")
     with refused(where=tmp_path, found="edges continue each other", expected="EQUIRECTANGULAR"):
-        refuse_panoramas(photos_of(tmp_path))
+        refuse_panoramas(files(tmp_path))
     for number in range(3):
         ramp = np.linspace(0, 255, 120)[None].repeat(60, 0)[..., None].repeat(3, 2)
         Image.fromarray(ramp.astype(np.uint8)).save(tmp_path / f"{number}.png")
-    refuse_panoramas(photos_of(tmp_path))
+    refuse_panoramas(files(tmp_path))

@@ -30,7 +30,6 @@ from bidnerf.structure.record import digest, open_work, remove_output
 from bidnerf.structure.sources import (
     FRAME_STEP,
     MOST,
-    SourceImage,
     choose_frames,
     measure_frames,
     photos_of,
@@ -38,7 +37,7 @@ from bidnerf.structure.sources import (
 )
 from bidnerf.testing import PoserContract
 from bidnerf_core.camera import CentralLens
-from bidnerf_core.datasets import Video, lacks_poses
+from bidnerf_core.datasets import Capture, Shot, lacks_poses
 from bidnerf_core.geometry import fit_similarity, look_at
 
 # Inside: each stage of the search for poses, with its rare geometry
@@ -213,7 +212,7 @@ def test_a_folder_inside_and_names_that_occur_twice(tmp_path: Path) -> None:
         write_photos(tmp_path / "capture" / folder, walk(2))
     assert lacks_poses(tmp_path / "capture")
     images = photos_of(tmp_path / "capture")
-    assert [image.name for image in images] == ["cam0_000", "cam0_001", "cam1_000", "cam1_001"]
+    assert images.names == ["cam0_000", "cam0_001", "cam1_000", "cam1_001"]
 
 
 def test_what_has_no_photos_or_has_poses(search: Search, tmp_path: Path, bidnerf: Run) -> None:
@@ -249,7 +248,7 @@ def test_too_few_photos_and_photos_without_overlap(tmp_path: Path) -> None:
 def test_a_damaged_database_is_refused_and_removed(tmp_path: Path) -> None:
     photos, out = tmp_path / "photos", tmp_path / "out"
     write_photos(photos, walk(3))
-    files = [image.file for image in photos_of(photos)]
+    files = [require(shot.file) for shot in photos_of(photos).shots]
     (open_work(out, digest(files, None), video=False) / "database.db").write_bytes(b"no database" * 100)
     with refused(where=out / "work" / "database.db", found="cannot be read", expected="begins anew"):
         bn.find_poses(photos, out)
@@ -311,7 +310,7 @@ def test_photos_of_one_lens_share_a_camera_however_they_are_turned(tmp_path: Pat
         write_photo(tmp_path / "c.jpg", pixels, FocalLengthIn35mmFilm=52),
         write_photo(tmp_path / "d.jpg", pixels[:100]),
     ]
-    found = list_photos([SourceImage(file.stem, file) for file in files], None)
+    found = list_photos(Capture(tmp_path, [Shot(image=file) for file in files]), None)
     assert [photo.camera for photo in found.photos] == [1, 1, 2, 3]
     assert (found.known_focal, found.fixed) == ({1, 2}, set())
     assert found.cameras[2].pinhole.fx == pytest.approx(2 * found.cameras[1].pinhole.fx)
@@ -391,7 +390,7 @@ def test_upright_axes_are_those_of_the_turned_image(tmp_path: Path) -> None:
 
 def bn_photo(folder: Path, code: int):  # type: ignore[no-untyped-def]
     file = write_photo(folder / f"{code}.jpg", np.zeros((4, 6, 3), np.uint8), code)
-    return list_photos([SourceImage("a", file)], None).photos[0]
+    return list_photos(Capture(folder, [Shot(image=file)]), None).photos[0]
 
 
 def test_many_photos_are_matched_with_neighbours_and_those_that_look_alike() -> None:
@@ -436,16 +435,16 @@ def test_a_video_is_thinned_by_its_motion_and_not_by_its_shaking(tmp_path: Path)
                 image = cv2.blur(image, (9, 1))
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode())
-    measures = measure_frames(Video(tmp_path / "clip.mp4"))
+    measures = measure_frames(photos_of(tmp_path / "clip.mp4"))
     assert len(measures) == len(poses)
     rest = measures[35][0] - measures[16][0]
     assert rest < 0.2 * measures[-1][0]
     frames = choose_frames(measures)
     assert sum(16 <= number < 36 for number in frames) <= 2
     assert sum(number % 3 == 1 for number in frames) <= len(frames) / 6
-    written = write_frames(Video(tmp_path / "clip.mp4"), tmp_path / "images", frames)
-    assert [int(image.name) for image in written] == frames
-    assert written[-1].time == pytest.approx(frames[-1] / 30, abs=1e-3)
+    written = write_frames(photos_of(tmp_path / "clip.mp4"), tmp_path / "images", frames)
+    assert [int(name) for name in written.names] == frames
+    assert written.shots[-1].time == pytest.approx(frames[-1] / 30, abs=1e-3)
     assert lacks_poses(tmp_path / "clip.mp4")
 
 

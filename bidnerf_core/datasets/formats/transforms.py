@@ -125,7 +125,7 @@ def _header(image: Path) -> tuple[tuple[int, int] | None, bool]:
         header = read_header(image)
     except InputError:
         return None, False
-    return (header.width, header.height), header.has_alpha
+    return header.size, header.has_alpha
 
 
 reader = Format(
