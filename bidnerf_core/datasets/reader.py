@@ -102,15 +102,13 @@ def read_capture(
         )
     shots = drop_missing_files(capture)
     farthest = 1e10  # even in millimetres from the centre of the Earth, its surface is at 6.4e9
-    for shot in shots:
-        pose = shot.T_world_camera
-        if pose is not None and not pose.translation.abs().max() < farthest:
-            position = ", ".join(f"{x:.3g}" for x in pose.translation.tolist())
-            raise InputError(
-                f"{shot.name} is at {position}",
-                where=capture.pose_file or path,
-                expected=f"coordinates below {farthest:g}",
-            )
+    positions = {shot.name: shot.T_world_camera.translation for shot in shots if shot.T_world_camera is not None}
+    if far := [(name, x) for name, x in positions.items() if not x.abs().max() < farthest]:
+        raise InputError(
+            f"{far[0][0]} is at {', '.join(f'{x:.3g}' for x in far[0][1].tolist())}",
+            where=capture.pose_file or path,
+            expected=f"coordinates below {farthest:g}",
+        )
     if not capture.splits:
         shots = hold_out(shots, rate=capture.rate)
         posed = [bool(shot.splits) for shot in shots if shot.T_world_camera is not None]
@@ -323,9 +321,9 @@ def no_dataset(path: Path, readers: Sequence[Reader] | None = None, or_else: str
             return InputError(
                 "is a video in a container that is not read", where=path, expected="MP4: convert it first"
             )
-        return InputError(
-            "is a file", where=path, expected=f"the folder of a dataset{or_else}; unpack an archive first"
-        )
+        is_archive = path.suffix.lower() in (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar")
+        expected = f"the folder of a dataset{or_else}{'; unpack the archive first' if is_archive else ''}"
+        return InputError("is an archive" if is_archive else "is a file", where=path, expected=expected)
     if (path / "cameras.json").is_file() and (path / "point_cloud").is_dir():
         return InputError(
             "is the output of 3D Gaussian Splatting",

@@ -39,7 +39,9 @@ KITTI_ROW = 12
 """Numbers in a KITTI row: a 3x4 matrix."""
 NANOSECONDS = 10**9
 LEAST_NANOSECONDS = 10**14
-"""Integer timestamps from here on are nanoseconds: as seconds, they would be three million years."""
+"""Timestamps from here on are nanoseconds: as seconds, they would be three million years."""
+LARGEST_SECONDS = 10**11
+"""Timestamps between this one and the least in nanoseconds are in no unit that is read: as seconds, they would be millennia."""
 
 
 @dataclass(frozen=True)
@@ -103,8 +105,8 @@ def _words(row: Row) -> list[str]:
 def _timed_rows(rows: Sequence[Row], path: Path, columns: str, nanoseconds: bool = False) -> list[TimedRow]:
     """Return rows that begin with a time stamp, followed by ``columns``, in chronological order.
 
-    Integer times are nanoseconds if ``nanoseconds`` is set, or if they are too large for seconds. Raises ``InputError``
-    for a row with too few entries or without a finite time, and if there are no rows.
+    Integer times are nanoseconds if ``nanoseconds`` is set, and all times if they are too large for seconds. Raises ``InputError``
+    for a row with too few entries, without a finite time or with one in another unit, and if there are no rows.
     """
     timed = list[TimedRow]()
     columns = f"timestamp {columns}"
@@ -115,8 +117,10 @@ def _timed_rows(rows: Sequence[Row], path: Path, columns: str, nanoseconds: bool
             raise row.error(f": {stamp[:60]!r} is not a time stamp") from error
         if not math.isfinite(time):
             raise row.error(f": the time stamp is {stamp[:60]}")
-        if stamp.isdecimal() and (nanoseconds or time >= LEAST_NANOSECONDS):
-            time = int(stamp) / NANOSECONDS
+        if time >= LEAST_NANOSECONDS or (nanoseconds and stamp.isdecimal()):
+            time = (int(stamp) if stamp.isdecimal() else time) / NANOSECONDS
+        elif abs(time) > LARGEST_SECONDS:
+            raise row.error(f": {stamp[:60]} is no time in seconds; is it in milliseconds?")
         timed.append(TimedRow(row, time, words))
     return sorted(timed, key=lambda row: row.time)
 

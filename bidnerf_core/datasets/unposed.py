@@ -9,7 +9,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from bidnerf_core.camera import Camera, CameraSource
 from bidnerf_core.datasets.capture import Capture, warn_about
@@ -114,16 +114,13 @@ def _pose_files(folder: Path, out: Path | None) -> Iterator[str]:
         if out is not None and here == out:
             inside.clear()
             continue
-        poses = sorted(name for name in (*inside, *names) if POSE_NAMES.search(name) and not _is_image(name))
+        others = [*inside, *(name for name in names if Path(name).suffix.lower() not in IMAGE_ENDINGS[1:])]
+        poses = sorted(name for name in others if POSE_NAMES.search(name))
         for name in [name for name in names if name.lower().endswith(".xmp")][:1]:
             with contextlib.suppress(InputError), open_binary(here / name, "XMP") as file:
                 poses += [name] if b"xcr:Position" in file.read(2**16) else []
         yield from (str((here / name).relative_to(folder)) for name in poses)
         inside[:] = [n for n in inside if n not in poses and not n.startswith(".") and here.parent != folder]
-
-
-def _is_image(name: str) -> bool:
-    return Path(name).suffix.lower() in IMAGE_ENDINGS[1:]
 
 
 def _without_copies(folder: Path, photos: Sequence[Path]) -> list[Path]:
@@ -146,42 +143,31 @@ def _without_copies(folder: Path, photos: Sequence[Path]) -> list[Path]:
     leave_out(
         [photo for photo, match in matches if match and photo.with_name(match[1]) in whole], "computed from photos"
     )
-    formats = defaultdict[Path, list[Path]](list)
-    for photo in left:
-        formats[photo.with_suffix("")].append(photo)
-    for files in formats.values():
-        files.sort(
-            key=lambda file: (file.suffix.lower() not in (".jpg", ".jpeg"), IMAGE_ENDINGS.index(file.suffix.lower()))
-        )
-    leave_out([file for files in formats.values() for file in files[1:]], "the same photos in another format")
-    groups, alike = (
-        defaultdict[Path, list[Path]](list),
-        defaultdict[tuple[Path, frozenset[str]], list[tuple[int, int, Path]]](list),
-    )
+    usual = (".jpg", ".jpeg", *IMAGE_ENDINGS)
+    ranks = {photo: [*usual, photo.suffix.lower()].index(photo.suffix.lower()) for photo in left}
+    chosen = {photo.with_suffix(""): photo for photo in sorted(left, key=lambda photo: -ranks[photo])}
+    leave_out([p for p in left if chosen[p.with_suffix("")] != p], "the same photos in another format")
+    groups, alike = defaultdict[Path, list[Path]](list), defaultdict[Any, list[tuple[int, int, Path]]](list)
     for photo in left:
         groups[photo.parent].append(photo)
     for below, group in groups.items():
         with contextlib.suppress(InputError):  # raised again when that photo is read
             size = read_header(group[0]).size
             alike[below.parent, frozenset(photo.stem for photo in group)].append((*size, below))
-    smaller = set[Path]()
-    for sized in alike.values():
-        largest, height_of_largest, _ = max(sized)
-        for width, height, below in sized:
-            # Sizes are rounded.
-            if width < largest and abs(height - width * height_of_largest / largest) <= 1:
-                smaller.add(below)
+    smaller = {
+        below
+        for largest, sized in ((max(sized), sized) for sized in alike.values())
+        for width, height, below in sized
+        if width < largest[0] and abs(height - width * largest[1] / largest[0]) <= 1  # sizes are rounded
+    }
     leave_out([photo for photo in left if photo.parent in smaller], "smaller copies of the photos beside them")
     return left
 
 
 def _is_deep_grey(photo: Path) -> bool:
-    if photo.suffix.lower() in (".jpg", ".jpeg"):
-        return False
-    try:
-        return read_header(photo).deep_grey
-    except InputError:  # raised again when that photo is read
-        return False
+    with contextlib.suppress(InputError):  # raised again when that photo is read
+        return photo.suffix.lower() not in (".jpg", ".jpeg") and read_header(photo).deep_grey
+    return False
 
 
 def _subfolders(folder: Path, out: Path | None) -> Iterator[Path]:
