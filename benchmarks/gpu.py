@@ -40,6 +40,7 @@ from paper_tables import test_frames
 
 from bidnerf import Localizer, View
 from bidnerf.evaluation import open_scene
+from bidnerf_bid import AdamSettings, AdamSteps, DescentSettings, ReachSettings, SampledLoss, objective_of, pivot
 from bidnerf_core.backend import SceneBounds, load_backend
 from bidnerf_core.devices import capture_graph, move_to, without_waiting
 from bidnerf_core.fields import RadianceField, derivatives_of, levels, render_image, trained_field
@@ -47,16 +48,9 @@ from bidnerf_core.geometry import SE3, perturb
 from bidnerf_core.io import from_plain
 from bidnerf_core.localization import (
     METHODS,
-    AdamSettings,
-    AdamSteps,
     ColourSettings,
     DepthLossSettings,
-    DescentSettings,
     RayTerms,
-    ReachSettings,
-    SampledLoss,
-    objective_of,
-    pivot,
     rig,
     states_at,
 )
@@ -87,7 +81,8 @@ def made_steps(
     there = None if device.type == "cpu" else device
     scene = Localizer(stored, "bid", device=there, warm_up=False).scene
     view = dataset.views("test", test_frames(folder, data, tuning=False)[:1])[0]
-    problem = rig(scene, [view], perturb(view.T_ref_camera, 0.1, 2.0, seed=0))
+    start = perturb(view.T_ref_camera, 0.1, 2.0, seed=0)
+    problem = rig(scene, [view], start)
     usual = METHODS["bid"].settings("paper-scene")
     loss = SampledLoss(
         move_to(problem, device),
@@ -99,7 +94,7 @@ def made_steps(
     )
     # Poses hardly move, so that all steps render the same.
     rate = AdamSettings(learning_rate=1e-9, decay=1.0)
-    return AdamSteps(loss, pivot("scene", problem), rate, problem.start_for("bid").to(device))
+    return AdamSteps(loss, pivot("scene", problem), rate, start.to(device))
 
 
 def measure_time(step: Callable[[], None], count: int) -> tuple[float, float]:

@@ -13,7 +13,6 @@ from typing import Any, Generic, Protocol, TypeVar, cast, runtime_checkable
 import torch
 from torch import Tensor, nn
 
-from bidnerf_core.fields import DEPTH_RESIDUALS as DEPTH_RESIDUALS
 from bidnerf_core.fields import DifferentiatedField as DifferentiatedField
 from bidnerf_core.fields import FieldDerivatives as FieldDerivatives
 from bidnerf_core.fields import FieldValues as FieldValues

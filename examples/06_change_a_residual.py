@@ -13,7 +13,7 @@ import torch
 import bidnerf as bn
 from bidnerf.results import pose_error
 from bidnerf.scenes import closed_form_data, closed_form_map
-from bidnerf_core.backend import DEPTH_RESIDUALS
+from bidnerf_bid import DEPTH_RESIDUALS
 from bidnerf_core.geometry import perturb
 from bidnerf_core.localization import settings_of
 

@@ -22,7 +22,7 @@ SHAPES = "BIDNERF_SHAPES"
 if os.environ.get(SHAPES) == "1":
     # Before the first import of the project: only modules that are imported afterwards are checked.
     install_import_hook(
-        ["bidnerf", "bidnerf_core", "bidnerf_adanerf", "bidnerf_hashgrid", "bidnerf_vanilla"],
+        ["bidnerf", "bidnerf_core", "bidnerf_adanerf", "bidnerf_bid", "bidnerf_hashgrid", "bidnerf_vanilla"],
         "shape_checks.checked",
     )
 
@@ -137,7 +137,7 @@ def small_images(monkeypatch: pytest.MonkeyPatch) -> None:
 
     module = sys.modules[closed_form_data.__module__]  # a function of the same name shadows it
     monkeypatch.setattr(module, "DEMO_CAMERA", tiny.CAMERA)
-    monkeypatch.setattr("bidnerf_core.localization.methods.RAYS", 64)
+    monkeypatch.setattr("bidnerf_bid.methods.RAYS", 64)
 
 
 @pytest.fixture

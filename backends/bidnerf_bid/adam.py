@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
+from bidnerf_bid.pivot import Pivot
+from bidnerf_bid.settings import AdamSettings
 from bidnerf_core.devices import capture_graph, constant, move_to, without_waiting
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.problem import Pivot
-from bidnerf_core.localization.settings import AdamSettings
 from bidnerf_core.progress import check_cancelled
 
 WINDOW = 20

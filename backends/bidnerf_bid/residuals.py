@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bidnerf_core.fields.rendering import Observations, Rendering
+from bidnerf_core.fields import Observations, Rendering
 from bidnerf_core.geometry import Robust
 
 Residual: TypeAlias = Callable[[Rendering, Observations], Float[Tensor, "*p c"]]

@@ -8,12 +8,14 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
+from bidnerf_bid.pixels import DRAWERS
+from bidnerf_bid.residuals import Objective, masked_mean
+from bidnerf_bid.settings import DescentSettings, ReachSettings
 from bidnerf_core.devices import constant
-from bidnerf_core.fields import Objective, Observations, Rays, masked_mean, render, widen
-from bidnerf_core.frames import DRAWERS, draw
+from bidnerf_core.fields import Observations, Rays, render, widen
+from bidnerf_core.frames import draw
 from bidnerf_core.geometry import SE3, Robust
-from bidnerf_core.localization.problem import Problem
-from bidnerf_core.localization.settings import DescentSettings, ReachSettings, rendered_depth_scale
+from bidnerf_core.localization import Problem, rendered_depth_scale
 
 DIFFERENT = 0.02
 """Colour difference from the background, in [0, 1], above which a pixel shows matter."""

@@ -1,4 +1,4 @@
-"""Radiance fields: the contract, samplers, rendering, and residuals of renderings."""
+"""Radiance fields: the contract, samplers and rendering."""
 
 from lazy_loader import attach_stub
 

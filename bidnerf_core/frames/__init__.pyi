@@ -17,12 +17,11 @@ from .photos import fit_depth as fit_depth
 from .photos import natural_order as natural_order
 from .photos import photos_in as photos_in
 from .photos import pinhole_of as pinhole_of
-from .pixels import DRAWERS as DRAWERS
-from .pixels import DrawerName as DrawerName
+from .pixels import PixelDrawer as PixelDrawer
 from .pixels import all_pixels as all_pixels
+from .pixels import among as among
 from .pixels import draw as draw
 from .pixels import inpaint as inpaint
-from .pixels import measured_middle as measured_middle
 from .pixels import observe as observe
 from .pixels import uniform as uniform
 from .pixels import visible_at as visible_at

@@ -8,16 +8,12 @@ ray.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
-from kornia.color import rgb_to_grayscale
-from kornia.feature import gftt_response
-from kornia.geometry.subpix import nms2d
 from scipy.ndimage import distance_transform_edt
 from torch import Generator, Tensor
-from torch.nn.functional import max_pool2d
 
 from bidnerf_core.camera import exposure_times, poses_of_rows
 from bidnerf_core.fields import Observations
@@ -91,45 +87,6 @@ def draw(
     return Observations.stacked([observe(view, drawer(view.frame, share, generator), dtype, device) for view in views])
 
 
-def measured_middle(views: Sequence[View]) -> Float[Tensor, "3"] | None:
-    """Return the component-wise median of the measured points, in the views' reference frame; None if there are none.
-
-    Every fourth pixel is used, and fewer in an image with millions of pixels.
-    """
-    points = []
-    for view in views:
-        if view.frame.depth is None:
-            continue
-        number = (view.frame.depth.flatten()[::4] > 0).nonzero()[:, 0]
-        number = 4 * number[:: max(1, len(number) // 200_000)]
-        width = view.frame.intrinsics.width
-        pixels = observe(view, torch.stack([number % width, number // width], dim=-1), torch.float64, "cpu")
-        points.append(pixels.points[pixels.measured])
-    together = torch.cat(points) if points else torch.zeros((0, 3))
-    return together.median(0).values if len(together) else None
-
-
-DrawerName = Literal["uniform", "interest-points", "interest-regions"]
-
-
-def interest_points(frame: Frame) -> Int[Tensor, "n 2"]:
-    """Return the corners (column, row) of a frame (Shi and Tomasi 1994, "Good features to track"), possibly none."""
-    if min(frame.rgb_bytes.shape[:2]) <= 3:  # no larger than the margin that the detector needs
-        return torch.zeros((0, 2), dtype=torch.long)
-    grey = rgb_to_grayscale(frame.rgb.detach().float().cpu().permute(2, 0, 1)[None])
-    response = nms2d(gftt_response(grey), (5, 5))[0, 0]
-    # Corners are at least a hundredth as strong as the strongest. A blank wall with noise of 1/255 stays below 1e-5.
-    return (response > max(0.01 * float(response.max()), 1e-5)).nonzero().flip(-1)
-
-
-def interest_regions(frame: Frame) -> Int[Tensor, "n 2"]:
-    """Return the interest points of a frame and the pixels up to six away from them along both axes, row by row."""
-    columns, rows = interest_points(frame).unbind(-1)
-    mask = torch.zeros((1, *frame.rgb_bytes.shape[:2]))
-    mask[0, rows, columns] = 1
-    return max_pool2d(mask, 13, stride=1, padding=6)[0].nonzero().flip(-1)
-
-
 def visible_at(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Bool[Tensor, "n"]:
     """Return a mask of those ``pixels`` (u, v, inside the image) that are not hidden."""
     if frame.hidden is None:
@@ -167,10 +124,4 @@ def among(choose: Callable[[Frame], Int[Tensor, "n 2"]]) -> PixelDrawer:
     return draw
 
 
-DRAWERS: dict[DrawerName, PixelDrawer] = {
-    "uniform": uniform,
-    "interest-points": among(interest_points),
-    "interest-regions": among(interest_regions),
-}
-"""The ways to draw pixels, by name."""
 among_visible = among(all_pixels)

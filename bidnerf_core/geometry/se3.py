@@ -137,17 +137,15 @@ class SE3:
         """Return the transform with ``offset`` (metres) added to its translation, and the same rotation."""
         return SE3(self.rotation, self.translation + offset.to(self.translation))
 
-    def retract_linearly(self, tangent: Float[Tensor, "*c 6"]) -> SE3:
-        """Approximate ``retract`` to first order in ``tangent``.
-
-        The approximation is cheaper and has the same value and derivative at 0, but elsewhere it is not rigid.
-        """
-        rho, phi = tangent[..., :3], tangent[..., 3:]
-        return SE3(self.rotation + self.rotation @ skew(phi), self.translation + _matvec(self.rotation, rho))
-
     def retract(self, tangent: Float[Tensor, "*c 6"]) -> SE3:
         """Return the right update ``self @ exp(tangent)``."""
         return self @ SE3.exp(tangent)
+
+    def retract_about(self, point: Float[Tensor, "3"], tangent: Float[Tensor, "*c 6"]) -> SE3:
+        """Return the right update whose tangent vector is that of a parallel frame at ``point`` (metres, frame b of ``T_a_b``)."""
+        T = self.translation
+        T_b_point = SE3(torch.eye(3, dtype=T.dtype, device=T.device), point.to(T))
+        return (self @ T_b_point).retract(tangent) @ T_b_point.inverse()
 
     def adjoint(self) -> Float[Tensor, "*b 6 6"]:
         """Return the adjoint matrix, for which ``T exp(xi) T^-1 = exp(adjoint(T) xi)`` (eq. 175)."""

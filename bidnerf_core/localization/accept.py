@@ -22,7 +22,6 @@ from torch import Tensor
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.problem import Pivot
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.settings import Range
 
@@ -344,14 +343,14 @@ def support(
     measurement's cost in images rendered in their mean colour; None unless colours alone are compared. ``others`` are poses (h) found by a
     search; those within ``DISPLACEMENT`` of ``T`` do not count as rivals.
     """
-    here, about = costs(T[None])[0], Pivot.at_point(middle.to(T.translation))
+    here = costs(T[None])[0]
     reach = float(torch.linalg.vector_norm(middle))
     # Twelve poses, displaced in both directions along and about each axis.
     size = torch.tensor([DISPLACEMENT * reach] * 3 + [DISPLACEMENT] * 3, dtype=torch.float64)
     steps = torch.cat([torch.diag(size), -torch.diag(size)]).to(T.translation)
     many = SE3(T.rotation.expand(12, 3, 3), T.translation.expand(12, 3))
     against = {} if plain is None else {"plain": float(log_odds(plain[None], here)[0])}
-    against["displaced"] = float(log_odds(costs(about.move(many, steps)), here).min())
+    against["displaced"] = float(log_odds(costs(many.retract_about(middle, steps)), here).min())
     if others is not None and len((far := others[~same_pose(T, others, middle)]).translation):
         against["other"] = float(log_odds(costs(far), here).min())
     explained = None

@@ -20,7 +20,7 @@ from bidnerf_core.localization.accept import Evidence, Support, least_confidence
 from bidnerf_core.localization.by_surface import localize_by_depth, localize_by_images
 from bidnerf_core.localization.explanations import CAMERAS, MOVING
 from bidnerf_core.localization.loop import LandmarkAnswer, Loop
-from bidnerf_core.localization.methods import BidConfig, Method, bid
+from bidnerf_core.localization.methods import METHODS, Method
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict, current_record
 from bidnerf_core.localization.settings import AutoConfig
@@ -68,7 +68,8 @@ def _on_surface(
         why = "the map has no surface ('bidnerf bake' makes one)"
         if problem.start is None:
             raise InputError("method 'auto' then needs a start; give one", where=why)
-        descended = bid(problem, BidConfig(), seed)
+        method = METHODS.load("bid", f"{why}, so method 'auto' descends as 'bid' does")
+        descended = method.solve(problem, method.settings(), seed)
         return replace(descended, reason=f"{why}; {descended.reason}")
     # If the map's own images usually have 150 matches, an image without recognised landmarks shows something else.
     if surface is None or (loop is not None and loop.landmarks.usual_matches >= 150):

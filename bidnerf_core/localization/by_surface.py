@@ -16,7 +16,7 @@ from bidnerf_core.devices import move_to
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3, random_units
 from bidnerf_core.localization.accept import Support, support
-from bidnerf_core.localization.problem import Pivot, Problem
+from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search import (
     COLOUR_SIGMA,
@@ -184,7 +184,7 @@ def hypotheses(
         """Displace poses about ``middle`` at random, with these standard deviations (fraction of the extent, radians)."""
         size = torch.tensor([translation * surface.extent] * 3 + [rotation] * 3, dtype=torch.float64)
         noise = torch.randn((len(T.translation), 6), generator=generator, dtype=torch.float64)
-        return Pivot.at_point(middle).move(T, noise * size)
+        return T.retract_about(middle, noise * size)
 
     near = 0 if start is None else max(1, count // 4)
     half = near + (count - near + 1) // 2

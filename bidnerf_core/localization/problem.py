@@ -1,7 +1,4 @@
-"""The localization problem: images with known relative poses, a map, and prior knowledge of the pose.
-
-Pivots are the points about which pose updates rotate, such as the middle of the visible scene.
-"""
+"""The localization problem: images with known relative poses, a map, and prior knowledge of the pose."""
 
 from __future__ import annotations
 
@@ -9,7 +6,7 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol, TypeVar, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -19,8 +16,8 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.depth import UNKNOWN, DepthSensorModel
 from bidnerf_core.devices import move_to, working_device
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields import Observations, RadianceField, SceneBounds, device_of, levels, render
-from bidnerf_core.frames import View, draw, measured_middle, uniform
+from bidnerf_core.fields import Observations, RadianceField, SceneBounds, device_of, levels
+from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, LengthUnit
 from bidnerf_core.localization.matching import LandmarkMatcher
 from bidnerf_core.mapping import LandmarkMap, SurfaceMap
@@ -118,12 +115,6 @@ class Problem:
     colour_noise: float | None
     sensor: DepthSensorModel  # model of the sensor that measured the depth
 
-    def start_for(self, method: str) -> SE3:
-        """Return the start. Raises ``InputError``, naming ``method``, if there is no start."""
-        if self.start is None:
-            raise InputError(f"method {method!r} needs a start; give one, or use a method that needs none")
-        return self.start
-
     @property
     def has_depth(self) -> bool:
         return self.depth_rays is not None or any(view.frame.has_depth for view in self.views)
@@ -201,75 +192,3 @@ def window(sequence: Sequence[_Item], last: int, size: int, stride: int = 1) -> 
     if not 0 <= last < len(sequence):
         raise InputError(f"the window ends at item {last} of {len(sequence)}, which does not exist")
     return tuple(sequence[i] for i in range(last, -1, -stride)[:size][::-1])
-
-
-PivotName = Literal["scene", "camera", "world"]
-
-
-@dataclass(frozen=True, eq=False)
-class Pivot:
-    """The centre of rotation of updates: a point fixed to the camera, or the world's origin."""
-
-    T_camera_pivot: SE3 | None  # a translation; None: the world's own frame
-
-    @staticmethod
-    def at_point(point: Float[Tensor, "3"]) -> Pivot:
-        """Return the pivot at a point in the camera's frame (metres), on the device of the point."""
-        return Pivot(SE3(torch.eye(3, dtype=torch.float64, device=point.device), point.to(torch.float64)))
-
-    @property
-    def lever_arm(self) -> float:
-        """Distance (metres) by which a rotation of one radian moves the camera.
-
-        It is 1 in the world's frame, since iNeRF does not balance steps of translation and rotation, and also for a pivot at the
-        camera, which no rotation moves.
-        """
-        reach = 0.0 if self.T_camera_pivot is None else float(self.T_camera_pivot.translation.norm())
-        return reach if reach > 0 else 1.0
-
-    def move(self, T: SE3, delta: Float[Tensor, "*h 6"]) -> SE3:
-        """Return ``T``, one pose or a batch, after the update ``delta``; differentiable in ``delta``."""
-        if self.T_camera_pivot is None:
-            return SE3.exp(delta) @ T  # a left update (iNeRF, section 3.1)
-        return (T @ self.T_camera_pivot).retract(delta) @ self.T_camera_pivot.inverse()
-
-    def move_linearly(self, T: SE3, delta: Float[Tensor, "*h 6"]) -> SE3:
-        """Approximate ``move`` to first order in ``delta``: cheaper, with the same value and derivative at 0."""
-        if self.T_camera_pivot is None:
-            return SE3.identity(device=delta.device).retract_linearly(delta) @ T
-        return (T @ self.T_camera_pivot).retract_linearly(delta) @ self.T_camera_pivot.inverse()
-
-
-def pivot(name: PivotName, problem: Problem) -> Pivot:
-    """Return a pivot by name: the camera (the paper's), the world's origin (iNeRF's), or the middle of the visible scene.
-
-    For a scene metres away, rotation and sideways translation of the camera change the image in almost the same way. In the
-    camera's frame, the objective is therefore a long narrow valley, in which first-order steps are slow. About the middle of the
-    visible scene, the two motions decouple.
-    """
-    if name == "world":
-        return Pivot(None)
-    return Pivot(SE3.identity()) if name == "camera" else Pivot.at_point(middle_of_view(problem, problem.start))
-
-
-@torch.no_grad()
-def middle_of_view(problem: Problem, T: SE3 | None) -> Float[Tensor, "3"]:
-    """Return the median of the measured points or, if there are none, of the points rendered from the pose ``T``; on the CPU.
-
-    The result is in the last camera's frame (metres). It is the middle of the scene's box if nothing is rendered, and 0 without a pose.
-    """
-    point = measured_middle(problem.views)
-    if point is not None:
-        return point.to("cpu", torch.float64)
-    if problem.depth_rays is not None:
-        return problem.depth_rays.points.to(torch.float64).cpu().median(0).values
-    if T is None:
-        return torch.zeros(3, dtype=torch.float64)
-    # The renderings of 128 rays give the middle of the visible scene.
-    some = draw(problem.views, 128, uniform, torch.Generator().manual_seed(0), device=problem.device).flattened()
-    seen = render(problem.level(0), some.rays(T.to(problem.device), problem.bounds), problem.bounds.background)
-    distance = torch.where(seen.opacity > 0.5, seen.distance / seen.opacity.clamp(min=0.5), torch.nan)
-    found = (some.origins + distance[..., None] * some.directions).nanmedian(-2).values.cpu().double()
-    if bool(found.isfinite().all()):
-        return found
-    return T.to("cpu", torch.float64).inverse().apply(torch.tensor(problem.bounds.centre, dtype=torch.float64))

@@ -109,7 +109,6 @@ class RayTerms:
 
     colour: ColourSettings
     depth: DepthLossSettings | None  # None: colour alone
-    exposure: bool = True
 
     def term(
         self,
@@ -130,7 +129,7 @@ class RayTerms:
         own = None if depth is None else problem.depth_rays
         drawn = RenderedRays.of(problem.views, problem.level(level), bounds, max(7, count), seed, blur, own)
         loss = Robust(self.colour.colour_loss, self.colour.colour_scale)
-        found = replace(drawn, loss=loss, exposure=self.exposure, sigma=sigma * mean_side(bounds))
+        found = replace(drawn, loss=loss, sigma=sigma * mean_side(bounds))
         if depth is None:
             return found
         scale = depth.depth_scale or rendered_depth_scale(bounds) / 2

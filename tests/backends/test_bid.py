@@ -11,32 +11,25 @@ import pytest
 import torch
 
 from bidnerf.scenes import GaussianBlobs
+from bidnerf_bid import (
+    AdamSettings,
+    AdamSteps,
+    DepthSettings,
+    DescentSettings,
+    InerfConfig,
+    Pivot,
+    ReachSettings,
+    SampledLoss,
+    objective_of,
+    pivot,
+)
+from bidnerf_bid.adam import RATE, WINDOW
+from bidnerf_bid.pivot import retract_linearly
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import FieldValues, RaySampler, SceneBounds, Stratified, render_image
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3, perturb
-from bidnerf_core.localization import (
-    METHODS,
-    AdamSettings,
-    AdamSteps,
-    ColourSettings,
-    DepthSettings,
-    DescentSettings,
-    InerfConfig,
-    Outcome,
-    Pivot,
-    Problem,
-    ReachSettings,
-    SampledLoss,
-    Support,
-    objective_of,
-    pivot,
-    rig,
-    settings_of,
-)
-
-# Inside: the length of a block of steps
-from bidnerf_core.localization.adam import RATE, WINDOW
+from bidnerf_core.localization import METHODS, ColourSettings, Outcome, Problem, Support, rig, settings_of
 from bidnerf_core.settings import to_flat
 from blob_images import BOUNDS, CAMERA, TRUTH
 from optional import require
@@ -55,7 +48,7 @@ def photograph(T_world_camera: SE3 = TRUTH) -> Frame:
 @pytest.fixture(autouse=True)
 def judged_on_fewer_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Judging a descent takes longer than most of these descents."""
-    monkeypatch.setattr("bidnerf_core.localization.methods.RAYS", 256)
+    monkeypatch.setattr("bidnerf_bid.methods.RAYS", 256)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +68,7 @@ def test_pixels_are_drawn_where_the_config_says(problem: Problem) -> None:
 def test_colours_have_to_be_explained_better_than_by_a_single_one(
     problem: Problem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bidnerf_core.localization.methods.RAYS", 1024)
+    monkeypatch.setattr("bidnerf_bid.methods.RAYS", 1024)
     found = localize(problem, "inerf", {"rays": 128, "max_steps": 100}, seed=0)
     assert found.outcome is Outcome.CONVERGED
     assert isinstance(found.diagnostics, Support)
@@ -124,6 +117,15 @@ def test_updates_are_written_where_the_pivot_is(problem: Problem) -> None:
     assert abs(float(middle.norm()) - 4) < 1  # the blobs are about the origin, four metres away
     turn = torch.cat([torch.zeros(3, dtype=torch.float64), XI[3:]])
     torch.testing.assert_close(about.move(TRUTH, turn).apply(middle), TRUTH.apply(middle))  # it stays
+
+
+def test_a_linear_update_has_the_value_and_the_derivative_of_the_exact_one() -> None:
+    T = SE3.exp(torch.tensor([0.3, -1.0, 2.0, 0.4, -0.7, 0.2], dtype=torch.float64))
+    zero = torch.zeros(6, dtype=torch.float64)
+    parts = (lambda x: T.retract(x).matrix(), lambda x: retract_linearly(T, x).matrix())
+    torch.testing.assert_close(parts[1](zero), parts[0](zero))
+    exact, linear = (torch.autograd.functional.jacobian(part, zero) for part in parts)
+    torch.testing.assert_close(linear, exact)
 
 
 def test_a_turn_moves_the_camera_as_far_as_a_shift(problem: Problem) -> None:
@@ -226,7 +228,7 @@ def loss_of(problem: Problem, **reach: float) -> SampledLoss:
 
 def gradient(loss: SampledLoss, problem: Problem) -> torch.Tensor:
     xi = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    value = loss(problem.start_for("bid").retract(xi))
+    value = loss(require(problem.start).retract(xi))
     return torch.autograd.grad(value, xi)[0] if value.requires_grad else torch.zeros(6)
 
 

@@ -8,11 +8,10 @@ import pytest
 import torch
 from scipy.ndimage import binary_dilation
 
+from bidnerf_bid import DRAWERS, DrawerName
+from bidnerf_bid.pixels import interest_points, interest_regions
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.frames import DRAWERS, DrawerName, Frame
-
-# Inside: where interest points lie, of which drawn pixels are a random sample
-from bidnerf_core.frames.pixels import among, interest_points, interest_regions
+from bidnerf_core.frames import Frame, among
 
 CAMERA = Intrinsics(40.0, 40.0, 32.0, 24.0, 64, 48)
 

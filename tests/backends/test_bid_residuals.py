@@ -8,21 +8,11 @@ import pytest
 import torch
 
 from bidnerf.scenes import GaussianBlobs
-from bidnerf_core.fields import (
-    DEPTH_RESIDUALS,
-    Objective,
-    Observations,
-    Rays,
-    RaySamples,
-    Rendering,
-    SceneBounds,
-    depth_residual,
-    free_space,
-    masked_mean,
-    render,
-)
+from bidnerf_bid import DEPTH_RESIDUALS, BidConfig, DepthSettings, Objective, objective_of
+from bidnerf_bid.residuals import depth_residual, free_space, masked_mean
+from bidnerf_core.fields import Observations, Rays, RaySamples, Rendering, SceneBounds, render
 from bidnerf_core.geometry import RobustName
-from bidnerf_core.localization import METHODS, BidConfig, ColourSettings, DepthSettings, objective_of
+from bidnerf_core.localization import METHODS, ColourSettings
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0)
 

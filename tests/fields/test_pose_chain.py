@@ -7,7 +7,9 @@ import torch
 
 from bidnerf.results import pose_error
 from bidnerf.scenes import GaussianBlobs, orbit
-from bidnerf_core.fields import Objective, Observations, SceneBounds, colour_term, depth_term, render, widen
+from bidnerf_bid import Objective
+from bidnerf_bid.residuals import colour_term, depth_term
+from bidnerf_core.fields import Observations, SceneBounds, render, widen
 from bidnerf_core.frames import View, draw, uniform
 from bidnerf_core.geometry import SE3, Robust, perturb
 from bidnerf_core.localization import Problem, rig

@@ -15,10 +15,11 @@ import torch
 
 from bidnerf import Frame, InputError, InputWarning, Intrinsics, View, open_dataset, open_sequence
 from bidnerf.scenes import demo_object
+from bidnerf_bid import DRAWERS, DrawerName
 from bidnerf_core.camera import Orientation, Raster
 from bidnerf_core.carving import FreeSpace
 from bidnerf_core.fields import RenderedImage
-from bidnerf_core.frames import DRAWERS, DrawerName, MaskFolder, WhollyHidden, masks_sentence, read_mask
+from bidnerf_core.frames import MaskFolder, WhollyHidden, masks_sentence, read_mask
 from bidnerf_core.localization.by_surface import is_blank
 from bidnerf_core.localization.terms.images import Thumbnail
 from bidnerf_core.localization.terms.rays import averaged

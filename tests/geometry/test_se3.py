@@ -118,15 +118,6 @@ def test_what_is_not_finite_mirrored_or_scaled_is_not_rigid() -> None:
     assert not bool(SE3(T.rotation, torch.tensor([0.0, math.inf, 0.0], dtype=torch.float64)).is_rigid())
 
 
-def test_a_linear_update_has_the_value_and_the_derivative_of_the_exact_one() -> None:
-    T = SE3.exp(torch.tensor([0.3, -1.0, 2.0, 0.4, -0.7, 0.2], dtype=torch.float64))
-    zero = torch.zeros(6, dtype=torch.float64)
-    parts = (lambda x: T.retract(x).matrix(), lambda x: T.retract_linearly(x).matrix())
-    torch.testing.assert_close(parts[1](zero), parts[0](zero))
-    exact, linear = (torch.autograd.functional.jacobian(part, zero) for part in parts)
-    torch.testing.assert_close(linear, exact)
-
-
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("matrix", [np.eye(4), [[1.0]], torch.eye(3), torch.eye(4)[0]])
 def test_what_is_no_tensor_of_matrices_is_refused(matrix: Any) -> None:

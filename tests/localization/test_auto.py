@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
-from importlib import import_module
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -16,10 +15,12 @@ from bidnerf import Localizer
 from bidnerf.evaluation import faulty
 from bidnerf.results import pose_error
 from bidnerf.scenes import demo_room
+from bidnerf_bid import AdamSettings, BidConfig, DescentSettings
 from bidnerf_core.fields import Observations
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3, perturb
-from bidnerf_core.localization import AutoConfig, Localization, Outcome, Problem, rig, settings_of
+from bidnerf_core.localization import METHODS, AutoConfig, Localization, Outcome, Problem, rig
+from bidnerf_core.registry import list_plugins, registered
 from localizations import assert_covered, assert_near, colour_only
 from problems import FieldMap, localize
 from refusals import refused
@@ -140,15 +141,28 @@ def test_a_map_without_a_surface_needs_a_start() -> None:
 
 
 def test_in_a_map_without_a_surface_it_descends_from_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    few = {"rays": 256, "max_steps": 60, "learning_rate": 0.08, "decay": 0.5, "decay_steps": 20}
-    auto = import_module("bidnerf_core.localization.auto")
-    monkeypatch.setattr(auto, "BidConfig", lambda: settings_of("bid", few))
+    steps = AdamSettings(max_steps=60, learning_rate=0.08, decay=0.5, decay_steps=20)
+
+    @dataclass(frozen=True)
+    class Few(BidConfig):
+        descent: DescentSettings = DescentSettings(rays=256, level=0, pivot="scene")
+        adam: AdamSettings = steps
+
+    monkeypatch.setitem(registered, ("methods", "bid"), replace(METHODS["bid"], config_type=Few))
     start = perturb(blob_images.TRUTH, 0.1, 3.0, seed=2)
     scene = FieldMap(blob_images.FIELD, blob_images.BOUNDS)
     found = Localizer(scene, warm_up=False)(blob_images.FRAME, start)
     assert found.method == "bid"
     assert "the map has no surface" in found.reason
     assert float(pose_error(found.T_world_camera, blob_images.TRUTH).translation) < 0.03
+
+
+def test_without_bid_a_map_without_a_surface_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    others = [info for info in list_plugins("methods") if info.name != "bid"]
+    monkeypatch.setattr("bidnerf_core.registry.list_plugins", lambda group: others)
+    localizer = Localizer(FieldMap(blob_images.FIELD, blob_images.BOUNDS), warm_up=False)
+    with refused(where="the map has no surface", found="no method 'bid'; installed: auto, inerf"):
+        localizer(blob_images.FRAME, blob_images.TRUTH)
 
 
 def test_the_field_refines_what_the_surface_found() -> None:

@@ -40,7 +40,7 @@ FEW = settings_of("bid", {"rays": 64, "max_steps": 3, "level": None})
 @pytest.fixture(autouse=True)
 def judged_on_few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whether a descent is accepted plays no part here, and judging it takes far longer than a few steps."""
-    monkeypatch.setattr("bidnerf_core.localization.methods.RAYS", 16)
+    monkeypatch.setattr("bidnerf_bid.methods.RAYS", 16)
 
 
 @functools.cache

@@ -66,7 +66,7 @@ def found_by(
 @pytest.fixture
 def hardly_judged(monkeypatch: pytest.MonkeyPatch) -> None:
     """Judging a short descent takes longer than its steps."""
-    monkeypatch.setattr("bidnerf_core.localization.methods.RAYS", 16)
+    monkeypatch.setattr("bidnerf_bid.methods.RAYS", 16)
 
 
 def off(T: SE3, truth: SE3 = TRUTH) -> float:

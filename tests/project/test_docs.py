@@ -29,7 +29,7 @@ from bidnerf.cli import COMMANDS, main
 from bidnerf.results import pose_error
 from bidnerf.scenes import demo_object
 from bidnerf.testing import BackendContract
-from bidnerf_core.fields import DEPTH_RESIDUALS
+from bidnerf_bid import DEPTH_RESIDUALS
 from bidnerf_core.geometry import SE3, perturb
 from bidnerf_core.localization import ADVICE, METHODS, AutoConfig, Problem, settings_of
 from bidnerf_core.maps import MapInfo

@@ -11,8 +11,8 @@ import pytest
 
 from bidnerf.evaluation import open_scene
 from bidnerf.scenes import closed_form_data, orbit
+from bidnerf_bid import DEPTH_RESIDUALS
 from bidnerf_core import registry
-from bidnerf_core.fields import DEPTH_RESIDUALS
 from commands import quietly
 
 pytestmark = pytest.mark.slow

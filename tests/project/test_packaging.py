@@ -21,8 +21,9 @@ pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-BACKENDS = PROJECT["entry-points"]["bidnerf.backends"]
-PACKAGES = ["bidnerf", "bidnerf_core", *sorted({value.partition(":")[0] for value in BACKENDS.values()})]
+BACKENDS, METHODS = (PROJECT["entry-points"][f"bidnerf.{group}"] for group in ("backends", "methods"))
+STOREYS = ["bidnerf", "bidnerf_core"]
+PACKAGES = [*STOREYS, *sorted({re.split("[.:]", value)[0] for value in (BACKENDS | METHODS).values()} - {*STOREYS})]
 
 
 @dataclass(frozen=True)
@@ -95,8 +96,10 @@ def test_an_installed_wheel_offers_and_loads_its_backends_and_has_the_command(in
         "from importlib.util import find_spec\n"
         "from bidnerf_core import registry\n"
         "from bidnerf_core.backend import load_backend\n"
+        "from bidnerf_core.localization import METHODS\n"
         "mine = [i for i in registry.list_plugins('backends') if i.distribution == 'bidnerf']\n"
         "loaded = {i.name: type(load_backend(i.name)).__module__ for i in mine}\n"
+        "assert METHODS['bid'].needs_start and not METHODS['auto'].needs_start\n"
         "others = [n for n in ('backends', 'tests', 'plugins') if find_spec(n)]\n"
         "print(json.dumps([registry.__file__, [[i.name, i.value, i.fault] for i in mine], loaded, others]))\n"
         "sys.argv = ['bidnerf', 'backends', '--json']\n"

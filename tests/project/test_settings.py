@@ -13,7 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bidnerf_core.localization import METHODS, AutoConfig, BidConfig, find_method, settings_of
+from bidnerf_bid import BidConfig
+from bidnerf_core.localization import METHODS, AutoConfig, find_method, settings_of
 from bidnerf_core.settings import EXPERT, Above, Count, OneOf, Range, Settings, from_flat, to_flat
 from refusals import refused
 

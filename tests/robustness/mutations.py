@@ -1,4 +1,4 @@
-"""Mutation testing: seeded faults in the core and the product, one at a time, and the share of them that the test suite catches.
+"""Mutation testing: seeded faults in the code, one at a time, and the share of them that the test suite catches.
 
     BIDNERF_DATA=... python tests/robustness/mutations.py [--tests ROOT] [--seconds 150] [--out out/mutations.json]
 
@@ -253,7 +253,7 @@ def run_tests_here(copy: Path, test: str, slow: bool, sound: Row | None) -> NoRe
         sys.settrace(record_call)
     status = pytest.main(options, plugins=[Recorder()])
     sys.settrace(None)
-    code, skipped = f"{copy}/bidnerf", len(f"{copy}/")
+    code, skipped = (f"{copy}/bidnerf", f"{copy}/backends/bidnerf"), len(f"{copy}/")
     entered = {(c.co_filename[skipped:], c.co_qualname) for c in codes if c.co_filename.startswith(code)}
     (copy / "result.json").write_text(json.dumps({"failed": failed, "entered": sorted(entered)}))
     os._exit(status)
@@ -265,7 +265,7 @@ class Measurement:
     def __init__(self, root: Path, copy: Path, rows: IO[str]) -> None:
         ignored = shutil.ignore_patterns(".*", "__pycache__", "out", "site", "dist", "build")
         shutil.copytree(root, copy, ignore=ignored)
-        [compileall.compile_dir(copy / name, quiet=2) for name in ("bidnerf", "bidnerf_core")]
+        [compileall.compile_dir(copy / name, quiet=2) for name in ("bidnerf", "bidnerf_core", "backends")]
         self.copy, self.rows = copy, rows
         # Of the sound code (None), and of each fault by its number.
         self.runs: dict[int | None, dict[Unit, Row]] = defaultdict(dict)

@@ -6,7 +6,7 @@ import torch
 
 from bidnerf.scenes import GaussianBlobs, orbit
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.fields import SceneBounds, render
+from bidnerf_core.fields import Observations, SceneBounds, render
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 
@@ -29,3 +29,20 @@ def photograph(T: SE3 = TRUTH, depth: bool = True, field: GaussianBlobs = FIELD)
 
 
 FRAME = photograph()
+T_CAMERA_LIDAR = SE3.exp(torch.tensor([0.3, -0.4, 0.1, 0.2, 1.5, -0.4], dtype=torch.float64))
+
+
+def scan() -> torch.Tensor:
+    """Points (n 3) of the lidar's frame, measured in a wide cone at rays that are no pixels; NaN where no return."""
+    ahead = torch.randn((2000, 3), generator=torch.Generator().manual_seed(5), dtype=torch.float64) * 0.3
+    ahead[:, 2] += 1.0
+    directions = T_CAMERA_LIDAR.inverse().rotate(torch.nn.functional.normalize(ahead, dim=-1))
+    T = TRUTH @ T_CAMERA_LIDAR
+    with torch.no_grad():
+        turned = T.rotate(directions)
+        found = render(FIELD, BOUNDS.rays(T.translation.expand_as(turned), turned))
+    return torch.where((found.opacity > 0.9)[:, None], found.distance[:, None] * directions, torch.nan)
+
+
+def lidar() -> Observations:
+    return Observations.from_points(scan(), T_CAMERA_LIDAR)

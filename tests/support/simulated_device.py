@@ -25,26 +25,29 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from bidnerf.testing import SCENE_BOUNDS, MapWithLandmarks, rgbd_views
+from bidnerf_bid import (
+    AdamSettings,
+    AdamSteps,
+    BidConfig,
+    DepthSettings,
+    DescentSettings,
+    SampledLoss,
+    objective_of,
+    pivot,
+)
 from bidnerf_core import devices
 from bidnerf_core.devices import move_to, without_waiting
 from bidnerf_core.fields import RadianceField, levels
 from bidnerf_core.localization import (
-    AdamSettings,
-    AdamSteps,
-    BidConfig,
     ColourSettings,
     DepthLossSettings,
-    DepthSettings,
-    DescentSettings,
     Problem,
     RayTerms,
-    SampledLoss,
-    objective_of,
-    pivot,
     rig,
     states_at,
 )
 from bidnerf_core.mapping import descend
+from optional import require
 
 DEVICE = torch.device("meta")
 """The simulated device."""
@@ -302,7 +305,7 @@ def _problem(field: RadianceField) -> Problem:
 
 def _first_order(problem: Problem, level: int, mode: Elsewhere | None) -> Tensor:
     """Return the pose (4 4) after two steps of Adam: the first fills caches, and the second must stay on the device."""
-    device, start = problem.device, problem.start_for("bid")
+    device, start = problem.device, require(problem.start)
     objective = objective_of(ColourSettings(), DepthSettings(depth_scale=0.1))
     settings = DescentSettings(CHECKED_RAYS, level=level)
     generator = torch.Generator(device).manual_seed(0)
@@ -318,7 +321,7 @@ def _first_order(problem: Problem, level: int, mode: Elsewhere | None) -> Tensor
 def _second_order(problem: Problem, level: int, mode: Elsewhere) -> None:
     terms = RayTerms(ColourSettings(), DepthLossSettings())
     rays = terms.term(problem, CHECKED_RAYS, 0, level)
-    start = move_to(states_at(problem.start_for("bid")[None]), DEVICE)
+    start = move_to(states_at(require(problem.start)[None]), DEVICE)
     with without_waiting():
         descend(start, [rays], 1)
         with mode.strict():

@@ -67,7 +67,7 @@ def captures(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
         found.append(replay is not step)
         return replay
 
-    monkeypatch.setattr("bidnerf_core.localization.adam.capture_graph", noted)
+    monkeypatch.setattr("bidnerf_bid.adam.capture_graph", noted)
     return found
 
 
@@ -80,7 +80,7 @@ def test_replayed_steps_are_those_that_are_launched(
     field = backend.build(backend.config_type(), BOUNDS)
     replayed = descent(field, BOUNDS, method)
     assert captures == [True]
-    monkeypatch.setattr("bidnerf_core.localization.adam.capture_graph", lambda step, *_: step)
+    monkeypatch.setattr("bidnerf_bid.adam.capture_graph", lambda step, *_: step)
     launched = descent(field, BOUNDS, method)
     assert len(replayed) == len(launched) == 51
     torch.testing.assert_close(replayed, launched, rtol=0, atol=1e-4)
