@@ -50,7 +50,7 @@ from bidnerf_core.localization import (
     METHODS,
     ColourSettings,
     DepthLossSettings,
-    RayTerms,
+    draw_rays,
     rig,
     states_at,
 )
@@ -198,7 +198,7 @@ def search_row(folder: str, data: str, device: torch.device) -> dict[str, Any]:
     problem = rig(stored.to(device), [view], None)
     pivot_of_scene = torch.tensor([0.0, 0.0, 3.5], dtype=torch.float64, device=device)
     for poses, rays in ((64, 256), (1, TIMED_RAYS)):
-        term = RayTerms(ColourSettings(), DepthLossSettings()).term(problem, rays, 0)
+        term = draw_rays(problem, ColourSettings(), DepthLossSettings(), rays, 0)
         starts = SE3.stack([perturb(view.T_ref_camera, 0.05, 2.0, seed) for seed in range(poses)])
         states = move_to(states_at(starts), device)
         step = partial(descend, states, [term], SEARCH_STEPS, pivot_of_scene)

@@ -29,8 +29,8 @@ from bidnerf_core.localization import (
     Localization,
     Method,
     Problem,
-    RayTerms,
     Support,
+    draw_rays,
     rendered_depth_scale,
     states_at,
     support,
@@ -77,7 +77,7 @@ def descend_from_start(
     T, mean = poses[-1], recent_loss(losses)
     # How well rays that were not used distinguish the pose from its rivals.
     by_depth = None if depth is None else DepthLossSettings(depth.depth_weight, depth.depth_loss, depth.depth_scale)
-    rays = RayTerms(config.colour, by_depth).term(problem, RAYS, seed, config.descent.level)
+    rays = draw_rays(problem, config.colour, by_depth, RAYS, seed, config.descent.level)
     rays = replace(rays, exposure=False)
     middle = middle_of_view(problem, T if bool(T.matrix().isfinite().all()) else None)
     measures = support(lambda T: rays.costs(states_at(T)), T, middle, rays.plain_costs())

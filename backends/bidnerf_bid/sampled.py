@@ -56,8 +56,11 @@ class SampledLoss:
             background = constant(self._bounds.background, pixels.rgb)
             shows = pixels.measured | ((pixels.rgb - background).abs().amax(-1) > DIFFERENT)
             rank = 2 * shows.int() + self._field.sampler(self._rays(pixels, here)).valid.any(-1).int()
-            order = rank.sort(dim=-1, descending=True, stable=True).indices
-            pixels = pixels.gathered(order[:, :count])
+            best = rank.sort(dim=-1, descending=True, stable=True).indices[:, :count]
+            parts = (
+                part.take_along_dim(best if part.ndim == 2 else best[..., None], 1) for part in vars(pixels).values()
+            )
+            pixels = Observations(*parts)
         found = self._loss(pixels, T_world_last)
         if problem.depth_rays is not None and self.objective.uses_depth and self.depth_rays > 0:
             others = problem.depth_rays.drawn(self.depth_rays, generator, device=device)[None]

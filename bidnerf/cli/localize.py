@@ -143,7 +143,7 @@ def run_localize(
         Localizer,
         landmark_cameras,
         matches_landmarks,
-        require_start,
+        require_fit,
     )
     from bidnerf_core.maps import MapCollection, load_map, maps_in
 
@@ -155,7 +155,11 @@ def run_localize(
         raise UsageError(f"no QUERY after {named};", expected=expected)
     start_of = start.of_queries(seed)
     with wrong_usage():
-        require_start(method.method, start.start is not None or start.perturb is not None)
+        require_fit(
+            method.method,
+            lambda chosen: not chosen.needs_start or start.start is not None or start.perturb is not None,
+            "needs a start; give one by --start, or use method",
+        )
     require_device(device)
     if start.perturb is not None and not queries.is_dataset(paths):
         raise UsageError("--perturb moves the true pose, which photos do not have;", expected="--start")

@@ -94,10 +94,6 @@ class Observations:
         """The measured points (metres, reference frame); the ray's origin where no distance was measured."""
         return self.origins + self.distance[..., None] * self.directions
 
-    def gathered(self, index: Int[Tensor, "k m"]) -> Observations:
-        """Select m rays from each row of rays of shape (k p), by ``index`` along the second axis."""
-        return self._map(lambda part: part.take_along_dim(index.reshape(*index.shape, *(1,) * (part.ndim - 2)), 1))
-
     def flattened(self) -> Observations:
         """Return these rays flattened to one axis."""
         return self._map(lambda part: part.reshape(-1, *part.shape[self.distance.ndim :]))

@@ -30,8 +30,7 @@ from .methods import USUAL_METHOD as USUAL_METHOD
 from .methods import Method as Method
 from .methods import find_method as find_method
 from .methods import matches_landmarks as matches_landmarks
-from .methods import require_start as require_start
-from .methods import require_use_of_depth as require_use_of_depth
+from .methods import require_fit as require_fit
 from .methods import settings_of as settings_of
 from .posterior import Posterior as Posterior
 from .problem import Problem as Problem
@@ -48,7 +47,7 @@ from .result import Outcome as Outcome
 from .result import SearchRecord as SearchRecord
 from .result import Verdict as Verdict
 from .result import record_search as record_search
-from .search import RayTerms as RayTerms
+from .search import draw_rays as draw_rays
 from .search import states_at as states_at
 from .settings import AutoConfig as AutoConfig
 from .settings import ColourSettings as ColourSettings

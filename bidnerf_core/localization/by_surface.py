@@ -21,10 +21,10 @@ from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search import (
     COLOUR_SIGMA,
     SHAPE_SIGMA,
-    RayTerms,
     SearchResult,
     Stage,
     conclude,
+    draw_rays,
     halve,
     localization_by_rays,
     states_at,
@@ -75,8 +75,8 @@ def localize_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig,
     aligned, path, losses = finest.fitted_noise(best), found.path, found.losses
     if config.refine_steps and supported:
         # The pose is nearly right, hence a small uncertainty of the field's surfaces.
-        terms = RayTerms(ColourSettings(), DepthLossSettings(depth_weight=1.0))
-        rays = terms.term(problem, config.refine_rays, seed, sigma=SHAPE_SIGMA / 4)
+        depth = DepthLossSettings(depth_weight=1.0)
+        rays = draw_rays(problem, ColourSettings(), depth, config.refine_rays, seed, sigma=SHAPE_SIGMA / 4)
         rays = replace(rays, noise=problem.colour_noise or rays.noise)
         steps: list[tuple[SE3, Tensor]] = []
         refined, _ = descend(best, [aligned, rays], config.refine_steps, middle, steps)
@@ -106,18 +106,20 @@ def localize_by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig
 
     Each answer is refined on rays rendered from the field. If no answer is accepted, the one with the smallest loss is returned.
     """
-    began, steps, answers = time.perf_counter(), config.by_colour, list[Localization]()
-    problem, terms = problem.without_depth(), RayTerms(config.by_colour.colour, None)
+    began, problem, answers = time.perf_counter(), problem.without_depth(), list[Localization]()
     if all(is_blank(view.frame) for view in problem.views):
         why = Verdict(Outcome.UNDETERMINED, "the image has a single colour, as if the lens were covered")
         path = (problem.start or SE3.identity())[None]
         return Localization.of(why, path, torch.zeros(0, dtype=torch.float64), "auto", began, math.nan)
     for number in range(config.rounds):
-        coarse = terms.term(problem, steps.fine_rays // 4, seed, level=0, blur=2, sigma=COLOUR_SIGMA)
-        fine, fresh = (terms.term(problem, steps.fine_rays, seed + more, sigma=COLOUR_SIGMA / 2) for more in (1, 2))
-        later = [Stage([coarse], min(4, steps.fine_steps), 2), Stage([fine], steps.fine_steps, 1)]
+        coarse = draw_rays(problem, config.colour, None, config.fine_rays // 4, seed, 0, 2, COLOUR_SIGMA)
+        fine, fresh = (
+            draw_rays(problem, config.colour, None, config.fine_rays, seed + more, sigma=COLOUR_SIGMA / 2)
+            for more in (1, 2)
+        )
+        later = [Stage([coarse], min(4, config.fine_steps), 2), Stage([fine], config.fine_steps, 1)]
         found, middle = by_images(problem, surface, config.hypotheses, seed + number, later)
-        answers.append(localization_by_rays(problem, found, fresh, middle, steps.converged_inliers, began))
+        answers.append(localization_by_rays(problem, found, fresh, middle, config.converged_inliers, began))
         if answers[-1].converged:
             break
     return min(answers, key=lambda answer: (not answer.converged, answer.loss))

@@ -30,7 +30,7 @@ from bidnerf_core.frames import Frame, View, photos_in
 from bidnerf_core.geometry import SE3, pose_from_matrix
 from bidnerf_core.io import LARGEST_INTEGER, png_bytes
 from bidnerf_core.localization.matching import LandmarkMatcher
-from bidnerf_core.localization.methods import USUAL_METHOD, find_method, require_use_of_depth, settings_of
+from bidnerf_core.localization.methods import USUAL_METHOD, find_method, require_fit, settings_of
 from bidnerf_core.localization.problem import (
     Problem,
     SceneMap,
@@ -109,7 +109,7 @@ class Localizer:
         pose is returned with an ``outcome`` other than ``CONVERGED``.
         """
         if depth_rays is not None:
-            require_use_of_depth(self.method)
+            require_fit(self.method, lambda used: used.uses_depth, "uses colour alone, got depth points; use method")
         origin = origin_of(self.scene)
         near = None if start is None else start_pose(start).translated(-origin)
         problem = self.problem(query, near, depth_rays)

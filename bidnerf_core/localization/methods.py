@@ -58,19 +58,7 @@ def find_method(name: str) -> Method:
     return METHODS.load(name)
 
 
-def require_use_of_depth(method: str) -> None:
-    """Raise ``InputError`` for a method that would ignore explicitly given depth points."""
-    _require(method, lambda chosen: chosen.uses_depth, "uses colour alone, got depth points; use method")
-
-
-def require_start(method: str, given: bool) -> None:
-    """Raise ``InputError`` if a method needs a start and none is ``given``."""
-    _require(
-        method, lambda chosen: given or not chosen.needs_start, "needs a start; give one by --start, or use method"
-    )
-
-
-def _require(method: str, fits: Callable[[Method], bool], problem: str) -> None:
+def require_fit(method: str, fits: Callable[[Method], bool], problem: str) -> None:
     """Raise ``InputError`` with the ``problem`` unless a method ``fits``; the message names the methods that do and can be loaded."""
     if fits(find_method(method)):
         return

@@ -103,37 +103,31 @@ def states_at(T: SE3) -> States:
     return replace(one[torch.zeros(len(T.translation), dtype=torch.long)], T=T.to("cpu", torch.float64))
 
 
-@dataclass(frozen=True)
-class RayTerms:
-    """The settings for comparing colours and, optionally, depths along rendered rays."""
+def draw_rays(
+    problem: Problem,
+    colour: ColourSettings,
+    depth: DepthLossSettings | None,
+    count: int,
+    seed: int,
+    level: int | None = None,
+    blur: int = 1,
+    sigma: float = 0.0,
+) -> RenderedRays:
+    """Draw ``count`` rays; return the term that compares their colours and, unless ``depth`` is None, their distances with renderings.
 
-    colour: ColourSettings
-    depth: DepthLossSettings | None  # None: colour alone
-
-    def term(
-        self,
-        problem: Problem,
-        count: int,
-        seed: int,
-        level: int | None = None,
-        blur: int = 1,
-        sigma: float = 0.0,
-    ) -> RenderedRays:
-        """Draw ``count`` rays; return their residual term at a level of the field (0 is the coarsest, None the field itself).
-
-        Observed colours are averaged over squares of ``blur`` pixels. ``sigma`` is the uncertainty of the map's surfaces, relative to the scene's mean side.
-        """
-        depth, bounds = self.depth, problem.bounds
-        if depth is not None and (depth.depth_weight == 0 or not problem.has_depth):
-            depth = None
-        own = None if depth is None else problem.depth_rays
-        drawn = RenderedRays.of(problem.views, problem.level(level), bounds, max(7, count), seed, blur, own)
-        loss = Robust(self.colour.colour_loss, self.colour.colour_scale)
-        found = replace(drawn, loss=loss, sigma=sigma * mean_side(bounds))
-        if depth is None:
-            return found
-        scale = depth.depth_scale or rendered_depth_scale(bounds) / 2
-        return replace(found, depth_loss=Robust(depth.depth_loss, scale), depth_weight=depth.depth_weight)
+    Level 0 of the field is the coarsest, None is the field itself. Observed colours are averaged over squares of ``blur`` pixels. ``sigma``
+    is the uncertainty of the map's surfaces, relative to the scene's mean side.
+    """
+    bounds = problem.bounds
+    if depth is not None and (depth.depth_weight == 0 or not problem.has_depth):
+        depth = None
+    own = None if depth is None else problem.depth_rays
+    drawn = RenderedRays.of(problem.views, problem.level(level), bounds, max(7, count), seed, blur, own)
+    found = replace(drawn, loss=Robust(colour.colour_loss, colour.colour_scale), sigma=sigma * mean_side(bounds))
+    if depth is None:
+        return found
+    scale = depth.depth_scale or rendered_depth_scale(bounds) / 2
+    return replace(found, depth_loss=Robust(depth.depth_loss, scale), depth_weight=depth.depth_weight)
 
 
 def localization_by_rays(

@@ -35,17 +35,6 @@ class DepthLossSettings(Settings):
     depth_scale: Positive | None = None
 
 
-@dataclass(frozen=True)
-class RefinementSettings(Settings):
-    """Settings of second-order steps on rendered rays from coarse to fine, and of their acceptance by newly drawn rays."""
-
-    fine_steps: Annotated[int, Range(1, 10**5)] = 8  # steps of the best pose, in full detail
-    # number of rays rendered for each of the fine steps, and of fractions of it before
-    fine_rays: Annotated[int, Range(7, 10**7)] = 1024
-    colour: ColourSettings = ColourSettings()
-    converged_inliers: NotNegative = 0.93  # minimum inlier fraction of the rays for an accepted pose
-
-
 def mean_side(bounds: SceneBounds) -> float:
     """Return the geometric mean of the sides of the scene's box, metres."""
     return math.prod(bounds.size) ** (1 / 3)
@@ -80,7 +69,14 @@ class AutoConfig(Settings):
     depth_sensor: Annotated[str, OneOf(DEPTH_SENSORS)] = "unknown"
     # tolerated fraction of wrong answers among the accepted ones; None for the usual acceptance
     risk: float | None = None
-    by_colour: Annotated[RefinementSettings, EXPERT] = RefinementSettings()
+    # The rest is of searches by images, which end with steps on rendered rays, and of their acceptance by newly drawn rays.
+    fine_steps: Annotated[int, Range(1, 10**5), EXPERT] = 8  # steps of the best pose, in full detail
+    # number of rays rendered for each of the fine steps, and of fractions of it before
+    fine_rays: Annotated[int, Range(7, 10**7), EXPERT] = 1024
+    colour: Annotated[ColourSettings, EXPERT] = ColourSettings()
+    converged_inliers: Annotated[float, Range(0.0), EXPERT] = (
+        0.93  # minimum inlier fraction of the rays for an accepted pose
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

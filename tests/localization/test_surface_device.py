@@ -17,7 +17,7 @@ from bidnerf_core.devices import move_to, without_waiting
 from bidnerf_core.fields import RadianceField
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, perturb
-from bidnerf_core.localization import ColourSettings, DepthLossSettings, Images, RayTerms, rig, states_at
+from bidnerf_core.localization import ColourSettings, DepthLossSettings, Images, draw_rays, rig, states_at
 from bidnerf_core.localization.terms.images import Thumbnail, surface_renderer
 from bidnerf_core.mapping import CostTerm, SurfaceMap, cast, descend, trace
 from problems import FieldMap
@@ -86,7 +86,7 @@ def align_points_and_render(place: Place) -> list[Tensor]:
     there = module_fields.surface().to(place.device)
     problem = rig(FieldMap(field, baked.BOUNDS, there), [view], None)
     points = baked.points(view, count=400, surface=there)
-    rays = RayTerms(ColourSettings(), DepthLossSettings()).term(problem, 64, 0)
+    rays = draw_rays(problem, ColourSettings(), DepthLossSettings(), 64, 0)
     return place.descended([points, rays], near(view, 1))
 
 

@@ -31,8 +31,8 @@ from bidnerf_core.localization import (
     DepthLossSettings,
     Images,
     Problem,
-    RayTerms,
     RenderedRays,
+    draw_rays,
     rig,
     states_at,
 )
@@ -111,8 +111,8 @@ def test_the_gradient_by_rays_is_the_numerical_one(
 ) -> None:
     """Fields are float32, and the intervals that are sampled, which have no derivative, move with the rays."""
     monkeypatch.setattr(rendering, "LEAST_WEIGHT", 0.0)
-    terms = RayTerms(ColourSettings("cauchy"), DepthLossSettings(depth_loss="cauchy") if depth else None)
-    rays = terms.term(problem(field), 100, 0)
+    of_depth = DepthLossSettings(depth_loss="cauchy") if depth else None
+    rays = draw_rays(problem(field), ColourSettings("cauchy"), of_depth, 100, 0)
     normal = rays(near())
     expected = numerical(lambda states: rays(states).cost, near(), 2e-3)
     torch.testing.assert_close(normal.gradient[:, :6], expected, rtol=0.05, atol=0.03 * float(expected.abs().max()))
@@ -141,7 +141,7 @@ def test_derivatives_of_rays_are_those_of_autograd_ray_by_ray(
 
 def test_rays_that_hit_nothing_have_no_derivative() -> None:
     away = states_at(T0.retract(torch.tensor([0, 0, 0, 3.14, 0, 0], dtype=torch.float64))[None])
-    rays = RayTerms(ColourSettings(), None, False).term(problem(BLOBS), 50, 0)
+    rays = replace(draw_rays(problem(BLOBS), ColourSettings(), None, 50, 0), exposure=False)
     normal = rays(away)
     assert not bool(normal.gradient.any())
     assert float(normal.cost) > 0
@@ -153,7 +153,7 @@ def test_measured_rays_of_another_sensor_join_pixels(monkeypatch: pytest.MonkeyP
     lidar = depth_rays_of([observed(BLOBS)])
     blank = View(Frame("blank", torch.zeros((40, 48, 3)), CAMERA, has_colour=False), SE3.identity())
     given = rig(FieldMap(BLOBS, BOUNDS), [blank], T0, lidar)
-    rays = RayTerms(ColourSettings(), DepthLossSettings()).term(given, 60, 0)
+    rays = draw_rays(given, ColourSettings(), DepthLossSettings(), 60, 0)
     assert float(rays.coloured.sum()) == 0
     normal = rays(near())
     expected = numerical(lambda states: rays(states).cost, near(), 2e-3)
@@ -165,8 +165,8 @@ def test_measured_rays_of_another_sensor_join_pixels(monkeypatch: pytest.MonkeyP
 def test_an_image_of_other_exposure_costs_the_same_once_it_is_eliminated() -> None:
     view = observed(BLOBS)
     darker = replace(view, frame=replace(view.frame, rgb=0.7 * view.frame.rgb + 0.1))
-    terms = RayTerms(ColourSettings("geman-mcclure"), None)
-    plain, other = (terms.term(problem(BLOBS, v), 300, 0) for v in (view, darker))
+    colour = ColourSettings("geman-mcclure")
+    plain, other = (draw_rays(problem(BLOBS, v), colour, None, 300, 0) for v in (view, darker))
     truth = states_at(T0[None])
     assert float(other(truth).cost) < 0.02 * float(other(near()).cost.min())
     assert float(plain(truth).cost) < 0.02 * float(plain(near()).cost.min())

@@ -117,7 +117,7 @@ def inside(workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.fixture
 def quick_auto(monkeypatch: pytest.MonkeyPatch, no_processes: None) -> None:
     """Method ``auto`` with few hypotheses and one round: that it finds poses is tested elsewhere."""
-    auto, by_colour = METHODS["auto"], AutoConfig().by_colour
+    auto = METHODS["auto"]
 
     def quick(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
         few = dataclasses.replace(
@@ -126,7 +126,8 @@ def quick_auto(monkeypatch: pytest.MonkeyPatch, no_processes: None) -> None:
             hypotheses=8,
             rounds=1,
             refine_rays=64,
-            by_colour=dataclasses.replace(by_colour, fine_steps=1, fine_rays=64),
+            fine_steps=1,
+            fine_rays=64,
         )
         return auto.solve(problem, few, seed)
 

@@ -177,6 +177,6 @@ def test_settings_are_checked_however_they_are_made() -> None:
     with refused(found="learning_rate is 0.0", expected="more than 0"):
         dataclasses.replace(BidConfig().adam, learning_rate=0.0)
     with refused(found="fine_rays is 6", expected="7 to 10,000,000"):
-        dataclasses.replace(AutoConfig().by_colour, fine_rays=6)
+        AutoConfig(fine_rays=6)
     with refused(found="points is 49", expected="50 to 1,000,000"):
         AutoConfig(points=49)

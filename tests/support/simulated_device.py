@@ -42,7 +42,7 @@ from bidnerf_core.localization import (
     ColourSettings,
     DepthLossSettings,
     Problem,
-    RayTerms,
+    draw_rays,
     rig,
     states_at,
 )
@@ -319,8 +319,7 @@ def _first_order(problem: Problem, level: int, mode: Elsewhere | None) -> Tensor
 
 
 def _second_order(problem: Problem, level: int, mode: Elsewhere) -> None:
-    terms = RayTerms(ColourSettings(), DepthLossSettings())
-    rays = terms.term(problem, CHECKED_RAYS, 0, level)
+    rays = draw_rays(problem, ColourSettings(), DepthLossSettings(), CHECKED_RAYS, 0, level)
     start = move_to(states_at(require(problem.start)[None]), DEVICE)
     with without_waiting():
         descend(start, [rays], 1)
