@@ -39,8 +39,14 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
         digit, part = shot.stem.partition("_")[0] if has_digits else "", image.parents[1]
         split = PREFIXES.get(digit) if part == path else part.name
         shots.append(replace(shot, splits=(split,) if split and shot.T_world_camera else ()))
-    expected = "a .txt file of 16 finite numbers for each image"
-    return Capture(path, shots, options.colour, "metres", depth_unit=unit, poses_expected=expected)
+    return Capture(
+        path,
+        shots,
+        options.colour,
+        "metres",
+        depth_unit=unit,
+        poses_expected="a .txt file of 16 finite numbers for each image",
+    )
 
 
 def read_matrix(file: Path, size: tuple[int, int], first_centre: float = 0.5) -> Intrinsics:

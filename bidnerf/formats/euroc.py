@@ -45,10 +45,17 @@ def _read(path: Path, root: Path, options: DatasetOptions) -> Capture:
     for row in rows:
         T_world_body = None if trajectory is None else trajectory.at(row.time)
         pose = None if T_world_body is None else T_world_body @ T_body_camera
-        image = root / "cam0" / "data" / row.words[0]
-        shots.append(Shot(image=image, camera=camera, T_world_camera=pose, time=row.time))
-    expected = f"mav0/{TRUTHS[0]}/data.csv at the times of the images"
-    return Capture(path, shots, options.colour, "metres", pose_file=truth, poses_expected=expected)
+        shots.append(
+            Shot(image=root / "cam0" / "data" / row.words[0], camera=camera, T_world_camera=pose, time=row.time)
+        )
+    return Capture(
+        path,
+        shots,
+        options.colour,
+        "metres",
+        pose_file=truth,
+        poses_expected=f"mav0/{TRUTHS[0]}/data.csv at the times of the images",
+    )
 
 
 def _find(path: Path) -> Path | None:

@@ -53,8 +53,9 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
     shots = LAYOUT.shots(images, camera, poses=by_name)
     times = [rows[number].numbers(count=1)[0] if number < len(rows) else None for number in numbers]
     shots = [replace(shot, time=time) for shot, time in zip(shots, times, strict=True)]
-    expected = f"poses.txt in it, or ../../poses/{name}"
-    return Capture(path, shots, options.colour, "metres", pose_file=file, poses_expected=expected)
+    return Capture(
+        path, shots, options.colour, "metres", pose_file=file, poses_expected=f"poses.txt in it, or ../../poses/{name}"
+    )
 
 
 def _calibration(file: Path, camera: str, size: tuple[int, int]) -> tuple[Intrinsics, SE3]:

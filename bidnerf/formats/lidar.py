@@ -66,8 +66,7 @@ class LidarDepth:
             return replace(measured, metres=metres)
         if confidence.shape != tuple(metres.shape):
             found = "x".join(map(str, confidence.shape[::-1]))
-            expected = f"{metres.shape[1]}x{metres.shape[0]} like its depth"
-            raise InputError(f"is {found}", where=where, expected=expected)
+            raise InputError(f"is {found}", where=where, expected=f"{metres.shape[1]}x{metres.shape[0]} like its depth")
         largest = int(confidence.max())
         high = next((scale for scale in sorted(self._scales) if 0 < largest <= scale), max(self._scales))
         if largest > high:

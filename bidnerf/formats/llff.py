@@ -45,8 +45,13 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
         down, right, back, position, (height, width, focal) = matrix.unbind(1)
         pose = rigid_pose(torch.stack([right, down, -back, position], 1), where)
         size, f = (round(float(width)), round(float(height))), float(focal)
-        camera = camera_of(where, (f, f, size[0] / 2, size[1] / 2), size, first_centre=0)
-        shots.append(Shot(image=image, camera=camera, T_world_camera=pose))
+        shots.append(
+            Shot(
+                image=image,
+                camera=camera_of(where, (f, f, size[0] / 2, size[1] / 2), size, first_centre=0),
+                T_world_camera=pose,
+            )
+        )
     return Capture(path, shots, options.colour, pose_file=file)
 
 

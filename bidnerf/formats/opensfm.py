@@ -43,8 +43,7 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
     parts = [part for part in found if isinstance(part, dict)] if isinstance(found, list) else []
     parts = [part for part in parts if isinstance(part.get("shots"), dict) and part["shots"]]
     if not parts:
-        expected = "a list of reconstructions with shots and cameras"
-        raise InputError("has no shots", where=file, expected=expected)
+        raise InputError("has no shots", where=file, expected="a list of reconstructions with shots and cameras")
     part = max(parts, key=lambda part: len(part["shots"]))
     entries, cameras, known = part["shots"], part.get("cameras"), dict[str, Camera]()
     if len(parts) > 1:
@@ -63,8 +62,10 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
             raise record.error("has no pose", expected="rotation and translation of 3 numbers each")
         rotation = torch.from_numpy(Rotation.from_rotvec(turn).as_matrix())
         T_world_camera = SE3(rotation, torch.tensor(position, dtype=torch.float64)).inverse()
-        time = record.number("capture_time") or None  # 0 where a photo does not record it
-        return Shot(image=image, camera=known[key], T_world_camera=T_world_camera, time=time)
+        # 0 where a photo does not record it
+        return Shot(
+            image=image, camera=known[key], T_world_camera=T_world_camera, time=record.number("capture_time") or None
+        )
 
     others = (".", "images", "opensfm/images", "../images")
     names = FileNames(*(path / place for place in others), images=options.image_folder)

@@ -74,8 +74,11 @@ def _shot(image: Path, name: str, listed: tuple[Row, dict[str, str]]) -> Shot:
     centre = width / 2 + number("px") * max(size), height / 2 + number("py") * max(size)
     lens = [number(key) for key in ("k1", "k2", "t1", "t2", "k3")]
     lens = lens if lens[4] else lens[:4]
-    camera = camera_of(row.where, (focal, focal, *centre), size, lens, first_centre=0)
-    return Shot(image=image, camera=camera, T_world_camera=pose)
+    return Shot(
+        image=image,
+        camera=camera_of(row.where, (focal, focal, *centre), size, lens, first_centre=0),
+        T_world_camera=pose,
+    )
 
 
 reader = Format(

@@ -128,8 +128,9 @@ def _unpack(file: ImageSource, kind: str, size: tuple[int, int]) -> np.ndarray:
     except Exception as error:  # a C library raises it
         raise InputError(f"not readable as LZFSE ({error})", where=file, expected="a complete file") from error
     if len(content) != (count := np.dtype(kind).itemsize * math.prod(size)):
-        expected = f"{count} according to metadata (dw, dh)"
-        raise InputError(f"unpacks to {len(content)} bytes", where=file, expected=expected)
+        raise InputError(
+            f"unpacks to {len(content)} bytes", where=file, expected=f"{count} according to metadata (dw, dh)"
+        )
     return np.frombuffer(content, kind).reshape(size[::-1])
 
 
@@ -149,8 +150,9 @@ def _cameras(metadata: Record, count: int) -> list[list[float]]:
     if len(rows) < count:
         rows = [[shared[i] for i in (0, 4, 6, 7)]] * count if len(shared) == 9 else []  # column by column
     if not rows or not all(isinstance(row, list) and len(row) >= 4 for row in rows):
-        found = "no K with 9 numbers, and no perFrameIntrinsicCoeffs with 4 for each frame"
-        raise metadata.error(found, expected="the intrinsics")
+        raise metadata.error(
+            "no K with 9 numbers, and no perFrameIntrinsicCoeffs with 4 for each frame", expected="the intrinsics"
+        )
     return [[metadata.checked_number(value, "an intrinsic") for value in row[:4]] for row in rows]
 
 

@@ -56,8 +56,15 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
             )
     shots = LAYOUT.shots(images, read_camera, unit, poses=poses)
     shots = [replace(shot, time=times.get(shot.stem)) for shot in shots]
-    expected = "a row with the time or the number of each image"
-    return Capture(path, shots, options.colour, "metres", depth_unit=unit, pose_file=file, poses_expected=expected)
+    return Capture(
+        path,
+        shots,
+        options.colour,
+        "metres",
+        depth_unit=unit,
+        pose_file=file,
+        poses_expected="a row with the time or the number of each image",
+    )
 
 
 def _local_transform(calibration: Path) -> SE3 | None:

@@ -33,10 +33,9 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
     camera = read_matrix(calibration, read_header(images[0]).size)
     depth_camera = read_matrix(of_depth, read_header(first).size) if first is not None and is_file(of_depth) else None
     sensor, unit = options.sensor(path, own_sensor(camera, depth_camera)), options.depth_unit or MILLIMETRE
-    shots = LAYOUT.shots(images, camera, unit, sensor)
     return Capture(
         path,
-        shots,
+        LAYOUT.shots(images, camera, unit, sensor),
         options.colour,
         unit="metres",
         depth_unit=unit,

@@ -55,14 +55,15 @@ def _read(path: Path, odometry: Path, options: DatasetOptions) -> Capture:
         pose = row.plain_numbers([words[name] or "nan" for name in POSE_COLUMNS])
         # The first versions wrote depth as .npy.
         depth = first_file(path / "depth", f"{stem}.png", f"{stem}.npy")
-        confidence = first_file(path / "confidence", f"{stem}.png")
         shots.append(
             Shot(
                 image=VideoPicture(video, number) if number < len(video) else video.path / stem,
                 camera=camera_of(where, own or of_all, video.size),
                 T_world_camera=pose_of_numbers(row.where, pose, opengl=False),
                 time=row.plain_numbers([words["timestamp"]])[0],
-                depth=None if depth is None else DepthFile(depth, partial(read, depth, confidence)),
+                depth=None
+                if depth is None
+                else DepthFile(depth, partial(read, depth, first_file(path / "confidence", f"{stem}.png"))),
                 stem=stem,
                 folders=(),
                 usual_side=lidar.LARGEST_SIDE,

@@ -37,8 +37,9 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
             values[name.strip()] = row.plain_numbers(text.split())
     colour, depth = (_camera(info, values, kind) for kind in ("Color", "Depth"))
     if colour is None:
-        expected = "16 numbers, with m_colorWidth and m_colorHeight"
-        raise InputError("no m_calibrationColorIntrinsic", where=info, expected=expected)
+        raise InputError(
+            "no m_calibrationColorIntrinsic", where=info, expected="16 numbers, with m_colorWidth and m_colorHeight"
+        )
     unit, sensor = options.depth_unit or MILLIMETRE, options.sensor(path, own_sensor(colour, depth))
     shots = LAYOUT.shots(images, CameraSource(options.given_camera or colour), unit, sensor)
     if (file := first_file(path, "split.txt", "../split.txt")) is not None:

@@ -256,8 +256,10 @@ def write_dataset(
         entries.append(entry)
     (folder / MODEL).mkdir(parents=True, exist_ok=True)
     model.write_binary(folder / MODEL)
-    content = {"camera_model": "OPENCV", "unit": unit, "frames": entries}
-    write_file(folder / TRANSFORMS, json.dumps(content, indent=1, allow_nan=False).encode())
+    write_file(
+        folder / TRANSFORMS,
+        json.dumps({"camera_model": "OPENCV", "unit": unit, "frames": entries}, indent=1, allow_nan=False).encode(),
+    )
 
 
 def from_colmap(camera: Any) -> Intrinsics | CentralLens:

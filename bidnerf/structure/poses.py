@@ -148,8 +148,9 @@ def _search(
     try:
         stored = pycolmap.Database.open(database)
     except RuntimeError as damage:
-        expected = "the same command once more, which begins anew"
-        raise InputError("cannot be read, perhaps damaged;", where=database, expected=expected) from damage
+        raise InputError(
+            "cannot be read, perhaps damaged;", where=database, expected="the same command once more, which begins anew"
+        ) from damage
     with stored as opened:
         photos.require_enough(source)
         if not opened.num_images():
@@ -192,7 +193,6 @@ def _search(
         for shot in images.shots
         if shot.name in reasons
     ]
-    turned = sum(by_number[number].exif.orientation != UPRIGHT for number in model.reg_image_ids())
     return FoundPoses(
         source=source.name,
         photos=len(images),
@@ -207,6 +207,6 @@ def _search(
         video=video,
         sure_pairs=sure,
         contradicting=contradicting,
-        turned=turned,
+        turned=sum(by_number[number].exif.orientation != UPRIGHT for number in model.reg_image_ids()),
         metric=metric,
     )

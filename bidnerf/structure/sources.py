@@ -108,8 +108,11 @@ def refuse_panoramas(files: Sequence[Path]) -> None:
         if b"equirectangular" in head:
             raise InputError("is a panorama (equirectangular)", where=path, expected=expected)
     if sum(joined) > len(joined) / 2:
-        found = "is twice as wide as high and its edges continue each other, as in a panorama (equirectangular)"
-        raise InputError(found, where=files[0].parent, expected=expected)
+        raise InputError(
+            "is twice as wide as high and its edges continue each other, as in a panorama (equirectangular)",
+            where=files[0].parent,
+            expected=expected,
+        )
 
 
 def _edges_continue(photo: Path) -> bool:

@@ -255,8 +255,11 @@ def agisoft_camera(where: str, kind: str, size: tuple[int, int], lens: Element) 
     is_fisheye = kind in ("fisheye", "equidistant_fisheye")
     unread = next((key for key in ("b2", "p3", "p4", *(("p1", "p2") if is_fisheye else ("k4",))) if values[key]), None)
     if unread or not (is_fisheye or kind == "frame"):
-        found = f"{unread} of the lens is {values[unread]:g}" if unread else f"the projection of the lens is {kind}"
-        raise InputError(found, where=where, expected="a lens that OpenCV describes; export undistorted images")
+        raise InputError(
+            f"{unread} of the lens is {values[unread]:g}" if unread else f"the projection of the lens is {kind}",
+            where=where,
+            expected="a lens that OpenCV describes; export undistorted images",
+        )
     numbers = f + b1, f, size[0] / 2 + cx, size[1] / 2 + cy
     with errors_in(where):
         if is_fisheye:

@@ -82,8 +82,14 @@ class Intrinsics:
     @staticmethod
     def from_hfov(degrees: float, width: int, height: int) -> Intrinsics:
         """Return an undistorted camera with a horizontal field of view of ``degrees``; see ``from_focal``."""
-        expected = "degrees between 0 and 180 (both excluded)"
-        check_number("horizontal field of view", degrees, Real, 1e-9, math.nextafter(180, 0), expected)
+        check_number(
+            "horizontal field of view",
+            degrees,
+            Real,
+            1e-9,
+            math.nextafter(180, 0),
+            "degrees between 0 and 180 (both excluded)",
+        )
         check_number("width", width, *LIMITS["size"])
         return Intrinsics.from_focal(focal_length(width, math.radians(degrees)), width, height)
 

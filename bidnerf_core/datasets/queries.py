@@ -62,18 +62,21 @@ class Photos:
     ) -> None:
         self._depth, self._remarks = depth or {}, set[str]()
         sensor = options.sensor("register_depth")
-        shots = [
-            PhotoShot(
-                image=file,
-                camera=options.camera_source,
-                depth_image=self._depth.get(file),
-                depth_unit=options.depth_unit,
-                sensor=sensor,
-                awaits_background=options.background is None,
-            )
-            for file in files
-        ]
-        self.capture = Capture(Path("photos"), shots, options.colour)
+        self.capture = Capture(
+            Path("photos"),
+            [
+                PhotoShot(
+                    image=file,
+                    camera=options.camera_source,
+                    depth_image=self._depth.get(file),
+                    depth_unit=options.depth_unit,
+                    sensor=sensor,
+                    awaits_background=options.background is None,
+                )
+                for file in files
+            ],
+            options.colour,
+        )
         if (masks := options.mask_folder) is not None:
             self.capture = self.capture.with_masks(masks, by_stem=True)
 

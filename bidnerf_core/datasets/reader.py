@@ -322,8 +322,11 @@ def no_dataset(path: Path, readers: Sequence[Reader] | None = None, or_else: str
                 "is a video in a container that is not read", where=path, expected="MP4: convert it first"
             )
         is_archive = path.suffix.lower() in (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar")
-        expected = f"the folder of a dataset{or_else}{'; unpack the archive first' if is_archive else ''}"
-        return InputError("is an archive" if is_archive else "is a file", where=path, expected=expected)
+        return InputError(
+            "is an archive" if is_archive else "is a file",
+            where=path,
+            expected=f"the folder of a dataset{or_else}{'; unpack the archive first' if is_archive else ''}",
+        )
     if (path / "cameras.json").is_file() and (path / "point_cloud").is_dir():
         return InputError(
             "is the output of 3D Gaussian Splatting",

@@ -83,8 +83,12 @@ def _read(path: Path, models: list[Path], options: DatasetOptions) -> Capture:
                 f"{len(others)} of {amount(len(photos), 'photo')} are not registered in the model and are left out, first:"
                 f" {others[0].relative_to(folder)}",
             )
-    shots = [shot_of(model, i, files.get(i.name, folder / posix_name(i.name)), cameras) for i in images]
-    return Capture(path, shots, options.colour, pose_file=model)
+    return Capture(
+        path,
+        [shot_of(model, i, files.get(i.name, folder / posix_name(i.name)), cameras) for i in images],
+        options.colour,
+        pose_file=model,
+    )
 
 
 def colmap_project(

@@ -77,17 +77,19 @@ def _read_video(path: Path, is_video: bool, options: DatasetOptions) -> Capture:
     source, video = options.camera_source, Video(path)
     if not source.is_given and not source.assumed:
         raise InputError("a video does not record its focal length", where=path, expected=f"a camera: {WAYS}")
-    shots = [
-        Shot(
-            image=VideoPicture(video, number, is_upright=True),
-            camera=source,
-            time=time,
-            stem=f"{number:06d}",
-            tells_camera=True,
-        )
-        for number, time in enumerate(video.times)
-    ]
-    return Capture(path, shots)
+    return Capture(
+        path,
+        [
+            Shot(
+                image=VideoPicture(video, number, is_upright=True),
+                camera=source,
+                time=time,
+                stem=f"{number:06d}",
+                tells_camera=True,
+            )
+            for number, time in enumerate(video.times)
+        ],
+    )
 
 
 reader = Format(
