@@ -2,9 +2,8 @@ from .exif import UPRIGHT as UPRIGHT
 from .exif import Exif as Exif
 from .exif import Orientation as Orientation
 from .exif import read_exif as read_exif
-from .files import CameraRecord as CameraRecord
 from .files import agisoft_camera as agisoft_camera
-from .files import camera_record as camera_record
+from .files import camera_of_record as camera_of_record
 from .files import read_camera as read_camera
 from .files import read_text_cameras as read_text_cameras
 from .intrinsics import CameraBatch as CameraBatch

@@ -11,13 +11,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bidnerf_core.camera.intrinsics import Intrinsics, focal_length, question_focal
+from bidnerf_core.camera.intrinsics import Intrinsics, focal_length, number_array, question_focal
 from bidnerf_core.camera.lenses import (
     FISHEYE,
     MODELS,
@@ -104,47 +103,13 @@ OWN_KEYS = {"fx", "fy", "cx", "cy", "width", "height", "distortion"}
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
-@dataclass(frozen=True)
-class CameraRecord:
-    """Intrinsics before the image size is known.
+def camera_of_record(record: Record, size: tuple[int, int]) -> Camera:
+    """Read the camera of a frame or of a whole file; without a size in it, it describes an image of ``size`` (width, height).
 
-    Each focal length is a number and a flag: pixels if the flag is ``False``, a field of view in radians if it is ``True``.
+    The principal point defaults to the image centre, and a panorama becomes its front face. Raises ``InputError`` for an unknown
+    camera model, for a focal length that is missing or not positive, and for implausible values.
     """
-
-    record: Record
-    width: int | None
-    height: int | None
-    model: str  # from ``MODELS``, or ``PERSPECTIVE``
-    focals: tuple[tuple[float, bool] | None, ...]  # along x and y; None for y: as along x
-    centre: tuple[float | None, float | None]
-    coefficients: tuple[float, ...]
-
-    def intrinsics(self, width: int, height: int) -> Camera:
-        """Return the camera for an image of this size; the principal point defaults to the image centre.
-
-        A panorama becomes its front face. Raises ``InputError`` for implausible values.
-        """
-        with errors_in(self.record.where):
-            if self.model == PANORAMA:
-                return PanoramaFace("front", (width, height))
-            fx, fy = (
-                focal and (focal_length(size, focal[0]) if focal[1] else focal[0])
-                for focal, size in zip(self.focals, (width, height), strict=True)
-            )
-            cx, cy = (size / 2 if c is None else c for size, c in zip((width, height), self.centre, strict=True))
-            is_lens = self.model != PERSPECTIVE
-            numbers = (fx or 0.0, fx or 0.0 if fy is None else fy, cx, cy, width, height)
-            flat = Intrinsics(*numbers, () if is_lens else self.coefficients)
-            question_focal(flat.fx, width, height)
-            return CentralLens(self.model, flat, self.coefficients) if is_lens else flat
-
-
-def camera_record(record: Record) -> CameraRecord:
-    """Read the intrinsics of a frame or of a whole file.
-
-    Raises ``InputError`` for an unknown camera model and for a focal length that is missing or not positive.
-    """
-    model, width, height = record.text("camera_model") or "", record.size("w"), record.size("h")
+    model, width, height = record.text("camera_model") or "", record.size("w") or size[0], record.size("h") or size[1]
     kinds = {name: kind for name, (_, kind, _) in MODELS.items() if name != "FULL_OPENCV"}
     kinds[PERSPECTIVE] = PERSPECTIVE
     kind = kinds.get(model.upper()) if model else PERSPECTIVE
@@ -152,38 +117,43 @@ def camera_record(record: Record) -> CameraRecord:
         raise record.error(f"camera_model is {model.upper()}", expected=f"one of {', '.join(kinds)}")
     if kind == PERSPECTIVE:  # some programs write 1 for true
         model = FISHEYE if record.value("is_fisheye") else PERSPECTIVE
-    model, lens = model.upper(), tuple[float, ...]()
-    focals: tuple[tuple[float, bool] | None, ...] = (None, None)
-    if model != PANORAMA:
-        focals = (_focal(record, "x"), _focal(record, "y"))
-        if focals[0] is None:
-            raise record.error("no focal length", expected="fl_x (pixels) or camera_angle_x (radians)")
-        k1, k2, k3, k4, p1, p2 = (record.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-        lens = (k1 if record.number("k1") is not None else record.number("k") or 0.0, k2, k3, k4)
-        if model != PERSPECTIVE:
-            lens = lens[: len(MODELS[model][2]) - 4]
-        elif k4:
-            raise record.error("k4 is not 0", expected="no distortion beyond k1 k2 p1 p2 k3")
-        else:  # in OpenCV's order; an ideal lens has none
-            lens = (k1, k2, p1, p2, k3) if k3 else (k1, k2, p1, p2) if any((k1, k2, p1, p2)) else ()
-    return CameraRecord(record, width, height, model, focals, (record.number("cx"), record.number("cy")), lens)
+    model = model.upper()
+    if model == PANORAMA:
+        with errors_in(record.where):
+            return PanoramaFace("front", (width, height))
+    fx, fy = _focal(record, "x", width), _focal(record, "y", height)
+    if fx is None:
+        raise record.error("no focal length", expected="fl_x (pixels) or camera_angle_x (radians)")
+    cx, cy = (record.number(key) for key in ("cx", "cy"))
+    k1, k2, k3, k4, p1, p2 = (record.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    k1 = k1 if record.number("k1") is not None else record.number("k") or 0.0
+    if model == PERSPECTIVE and k4:
+        raise record.error("k4 is not 0", expected="no distortion beyond k1 k2 p1 p2 k3")
+    lens = (k1, k2, p1, p2, k3) if k3 else (k1, k2, p1, p2) if any((k1, k2, p1, p2)) else ()  # an ideal lens has none
+    centre = width / 2 if cx is None else cx, height / 2 if cy is None else cy
+    with errors_in(record.where):
+        flat = Intrinsics(fx, fx if fy is None else fy, *centre, width, height, lens if model == PERSPECTIVE else ())
+        question_focal(flat.fx, width, height)
+        if model == PERSPECTIVE:
+            return flat
+        return CentralLens(model, flat, (k1, k2, k3, k4)[: len(MODELS[model][2]) - 4])
 
 
-def _focal(record: Record, axis: str) -> tuple[float, bool] | None:
-    """Return the focal length of an axis and ``False``, or its field of view and ``True``.
+def _focal(record: Record, axis: str, side: int) -> float | None:
+    """Return the focal length (pixels) along an axis, on which the image has ``side`` pixels.
 
-    A frame's own value takes precedence over the file's, and a value in pixels over one in radians.
+    A frame's own value takes precedence over the file's, and a value in pixels over a field of view in radians.
     """
     for scope in record.scopes():
         focal, angle = scope.number(f"fl_{axis}"), scope.number(f"camera_angle_{axis}")
         if focal is not None:
             if focal <= 0:
                 raise record.error(f"fl_{axis} is {focal:g}", expected="a positive number of pixels")
-            return focal, False
+            return focal
         if angle is not None:
             if not 0 < angle < math.pi:
                 raise record.error(f"camera_angle_{axis} is {angle:g}", expected="radians between 0 and pi")
-            return angle, True
+            return focal_length(side, angle)
     return None
 
 
@@ -292,8 +262,7 @@ def _json_camera(record: Record, size: tuple[int, int]) -> Camera:
         values |= {"distortion_model": str(values.get("model", "")).rpartition(".")[2]}
     if any(values.get(key) for key in ("intrinsic_matrix", "intrinsic", *KEYS["K"])):
         return parse_calibration(record.where, values, size)
-    camera = camera_record(record)
-    return camera.intrinsics(camera.width or size[0], camera.height or size[1])
+    return camera_of_record(record, size)
 
 
 def _splat_cameras(path: Path, content: bytes) -> dict[str, Camera]:
@@ -381,10 +350,10 @@ def parse_calibration(where: str, values: Mapping[str, Any], size: tuple[int, in
     pair = _first(values, "size")
     if pair is None:
         pair = [_first(values, key) or 0 for key in ("width", "height")]
-    sides = _array(where, pair)
-    if sides.size != 2 or not np.isfinite(sides).all():
+    sides = _array(where, pair).ravel().astype(int).tolist()
+    if len(sides) != 2:
         raise InputError(f"size is {str(pair)[:60]!r}", where=where, expected="width and height in pixels")
-    width, height = (int(value) for value in sides.ravel())
+    width, height = sides
     known = (width, height) if width > 0 and height > 0 else size
     return _opencv_camera(where, K, tuple(_array(where, lens or []).ravel().tolist()), model, known)
 
@@ -410,9 +379,6 @@ def _first(values: Mapping[str, Any], what: str) -> Any:
 
 
 def _array(where: str, given: Any) -> np.ndarray:
-    """Convert a list, or the ``data`` of an OpenCV or ROS matrix, to an array."""
-    values = given.get("data") if isinstance(given, Mapping) else given
-    try:
-        return np.asarray(values, dtype=float)  # YAML reads 1e-05 as text
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{str(given)[:60]!r}", where=where, expected="numbers") from error
+    """Convert a list, or the ``data`` of an OpenCV or ROS matrix, to an array of finite numbers; YAML reads 1e-05 as text."""
+    with errors_in(where):
+        return number_array("an entry", given.get("data") if isinstance(given, Mapping) else given)

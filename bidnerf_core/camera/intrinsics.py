@@ -49,7 +49,7 @@ class Intrinsics:
     def __post_init__(self) -> None:
         given: Any = self.distortion
         if isinstance(given, np.ndarray | Tensor):
-            object.__setattr__(self, "distortion", tuple(_numbers("distortion", given).ravel().tolist()))
+            object.__setattr__(self, "distortion", tuple(number_array("distortion", given).ravel().tolist()))
         for names, what in (
             ("fx fy", "focal length"),
             ("cx cy", "principal point"),
@@ -102,8 +102,8 @@ class Intrinsics:
         centre at (0, 0), ours at (0.5, 0.5), so half a pixel is added to the principal point. Raises
         ``InputError`` if these values do not describe a camera.
         """
-        matrix = _numbers("K", K)
-        lens = () if distortion is None else _numbers("distortion", distortion).ravel().tolist()
+        matrix = number_array("K", K)
+        lens = () if distortion is None else number_array("distortion", distortion).ravel().tolist()
         if matrix.size != 9:
             raise InputError(f"K has shape {matrix.shape}", expected="the 3 x 3 matrix of a camera")
         (fx, skew, cx), (zero, fy, cy), last = matrix.reshape(3, 3).tolist()
@@ -114,7 +114,7 @@ class Intrinsics:
             )
         if size is None or len(size) != 2:
             raise InputError(f"size is {size!r:.60}", expected="(width, height) of the image in pixels")
-        width, height = (int(side) if side.is_integer() else side for side in _numbers("size", size).tolist())
+        width, height = (int(side) if side.is_integer() else side for side in number_array("size", size).tolist())
         camera = Intrinsics(fx, fy, cx + 0.5, cy + 0.5, width, height, tuple(lens) if any(lens) else ())
         question_focal(fx, width, height)
         return camera
@@ -282,7 +282,8 @@ def question_focal(focal: float, width: int, height: int) -> None:
         )
 
 
-def _numbers(name: str, given: Any) -> np.ndarray:
+def number_array(name: str, given: Any) -> np.ndarray:
+    """Convert an array, a tensor or lists to floats. Raises ``InputError`` for anything else, and for NaN and infinity."""
     try:
         array = np.asarray(given.detach().cpu() if isinstance(given, Tensor) else given, dtype=float)
     except (TypeError, ValueError) as error:

@@ -29,7 +29,7 @@ from functools import partial
 from pathlib import Path
 from typing import get_args
 
-from bidnerf_core.camera import Camera, CameraSource, PanoramaFace, same_aspect
+from bidnerf_core.camera import Camera, CameraSource, PanoramaFace, camera_of_record, same_aspect
 from bidnerf_core.datasets.capture import Capture, DepthFile, Shot, warn_about
 from bidnerf_core.datasets.file_names import FileNames
 from bidnerf_core.datasets.formats.transforms_json import SPLIT_FILES, FrameRecord, read_splits
@@ -96,10 +96,9 @@ def _read(path: Path, files: list[Path], options: DatasetOptions) -> Capture:
 
 def _camera(frame: FrameRecord, size: tuple[int, int] | None) -> Camera | CameraSource:
     """Return the camera of a frame; without a size in the file, the first image's size is used, since all images share the lens."""
-    width, height = frame.camera.width or (size and size[0]), frame.camera.height or (size and size[1])
-    if width is None or height is None:  # no image is readable, which is an error when one is read
-        return CameraSource()
-    return frame.camera.intrinsics(width, height)
+    if size is None and None in (frame.record.size("w"), frame.record.size("h")):
+        return CameraSource()  # no image is readable, which is an error when one is read
+    return camera_of_record(frame.record, size or (0, 0))
 
 
 def _first_size(frames: Sequence[FrameRecord], images: Sequence[Path]) -> tuple[int, int] | None:
@@ -108,7 +107,7 @@ def _first_size(frames: Sequence[FrameRecord], images: Sequence[Path]) -> tuple[
         size, _ = _header(image)
         if size is None:
             continue
-        given = frame.camera.width or size[0], frame.camera.height or size[1]
+        given = frame.record.size("w") or size[0], frame.record.size("h") or size[1]
         if given != size and same_aspect(given, size):
             warn_about(
                 frame.record.where,

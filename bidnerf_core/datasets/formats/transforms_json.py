@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from bidnerf_core.camera import CameraRecord, camera_record
 from bidnerf_core.datasets.capture import SPLITS, warn_about
 from bidnerf_core.datasets.file_names import posix_name
 from bidnerf_core.datasets.formats.photos import timestamp
@@ -30,7 +29,6 @@ class FrameRecord:
 
     record: Record
     file_path: PurePosixPath  # as in the file, without a leading "./"
-    camera: CameraRecord
     T_world_camera: SE3
     scale: float  # scale removed from the frame's matrix; 1 if the matrix was rigid
     depth_path: PurePosixPath | None
@@ -128,9 +126,7 @@ def _frame(file: Record, number: int, entry: object) -> FrameRecord:
         raise own.error("no file_path", expected="the name of its image")
     record = Record(f"{where} ({path})", entry, file)
     posed, masked = pose_and_scale(Record(record.where, entry)), posix_name(mask) if mask else None
-    return FrameRecord(
-        record, posix_name(path), camera_record(record), *posed, *_depth(record, own), _time(own), masked
-    )
+    return FrameRecord(record, posix_name(path), *posed, *_depth(record, own), _time(own), masked)
 
 
 def _depth(record: Record, own: Record) -> tuple[PurePosixPath | None, float]:
