@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_scan import importer, read_scan
 from bidnerf_scan.scan import cleaned
 
@@ -62,6 +62,20 @@ def test_no_file_outside_of_the_folder_is_opened(tmp_path: Path) -> None:
         (inside / "a.obj").write_text(f"mtllib {name}\n{corners}")
         rgb = read_scan(inside / "a.obj").rgb
         assert (rgb is not None and rgb[0].tolist() == [1, 0, 0]) == is_red
+
+
+@pytest.mark.parametrize(
+    ("material", "missing"),
+    [(None, "own.mtl"), ("map_Kd lost.png", "lost.png"), ("map_Kd -clamp on lost.png", "lost.png")],
+)
+def test_an_obj_without_its_material_has_no_colours(material: str | None, missing: str, tmp_path: Path) -> None:
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+    (tmp_path / "a.obj").write_text(f"mtllib own.mtl\n{corners}")
+    if material is not None:
+        (tmp_path / "own.mtl").write_text(f"newmtl m\nKd 1 1 1\n{material}\n")
+    with pytest.warns(InputWarning, match=f"{missing}, its material or texture, is missing"):
+        scan = read_scan(tmp_path / "a.obj")
+    assert (scan.rgb, len(scan.images)) == (None, 0)
 
 
 def test_a_gltf_is_placed_by_its_nodes(tmp_path: Path) -> None:

@@ -17,8 +17,8 @@ MOST_POINTS, MOST_COPIES = 2 * 10**8, 16
 MOST_TEXELS = 2 * 10**9
 
 
-def read(path: Path, expected: str) -> Scan:
-    """Return all meshes of a file as one or, if it has none, its points.
+def read(path: Path, expected: str, has_materials: bool = True) -> Scan:
+    """Return all meshes of a file as one or, if it has none, its points; without ``has_materials``, only vertices have colours.
 
     The file's counts must have been checked. Raises ``InputError`` if trimesh cannot read it.
     """
@@ -32,7 +32,7 @@ def read(path: Path, expected: str) -> Scan:
             sizes = {id(geometry): len(getattr(geometry, "vertices", ())) for _, geometry in nodes}
             count = sum(sizes[id(geometry)] for _, geometry in nodes)
             most = min(MOST_POINTS, MOST_COPIES * sum(sizes.values()))
-            parts = [] if count > most else [_placed(scene, node) for node, _ in nodes]
+            parts = [] if count > most else [_placed(scene, node, has_materials) for node, _ in nodes]
     except (Exception, RecursionError) as error:  # trimesh raises whatever its parsing steps raise
         said = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         raise InputError(
@@ -49,7 +49,7 @@ def read(path: Path, expected: str) -> Scan:
     return joined(chosen)
 
 
-def _placed(scene: Any, node: str) -> Scan:
+def _placed(scene: Any, node: str, has_materials: bool) -> Scan:
     """Return the geometry of a node, in the coordinates of the file."""
     transform, name = scene.graph[node]
     geometry = scene.geometry[name]
@@ -60,7 +60,7 @@ def _placed(scene: Any, node: str) -> Scan:
         return Scan(points, _vertex_colours(geometry, len(points)))
     faces = np.asarray(faces, np.int64)
     if geometry.visual.kind == "texture":
-        return _textured(geometry.visual, points, faces)
+        return _textured(geometry.visual, points, faces, has_materials)
     if geometry.visual.kind == "face":
         rgb = in_unit_range(np.asarray(geometry.visual.face_colors)[:, :3])
         corners = np.arange(faces.size).reshape(faces.shape)
@@ -76,9 +76,9 @@ def _vertex_colours(geometry: Any, count: int) -> NDArray[np.float32] | None:
     return in_unit_range(colours[:, :3]) if len(colours) == count else None
 
 
-def _textured(visual: Any, points: NDArray[np.float64], faces: NDArray[np.int64]) -> Scan:
+def _textured(visual: Any, points: NDArray[np.float64], faces: NDArray[np.int64], has_materials: bool) -> Scan:
     """Return a mesh with a material: a texture, a colour, or both."""
-    image, colour = _material(visual.material)
+    image, colour = _material(visual.material) if has_materials else (None, None)
     rgb = None if colour is None else np.broadcast_to(colour, (len(points), 3)).astype(np.float32)
     attributes = getattr(visual, "vertex_attributes", None)
     found = attributes.get("color") if attributes is not None else None
