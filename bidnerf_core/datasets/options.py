@@ -32,8 +32,9 @@ class DatasetOptions:
     """
 
     camera: Annotated[Camera | CameraSource | str | Path | None, "CAMERA.json"] = None
-    """camera of images whose format stores none: a file with intrinsics from nerfstudio, COLMAP, ROS or OpenCV (YAML), Open3D,
-    hloc or 3D Gaussian Splatting (TUM RGB-D: also freiburg1, freiburg2 or freiburg3)"""
+    """camera of images whose format stores none: a file with intrinsics, as JSON of nerfstudio, Open3D, RealSense, 3D Gaussian
+    Splatting or an answer, COLMAP's cameras.txt, a list of hloc, YAML of ROS, OpenCV, ORB-SLAM or Kalibr, ROS's ost.txt, XML of
+    OpenCV or Agisoft, or a 3x3 matrix as text (TUM RGB-D: also freiburg1, freiburg2 or freiburg3)"""
 
     images: Annotated[str | Path | None, EXPERT, "FOLDER"] = None
     """folder of the images that the files of a dataset list, if they lie elsewhere"""

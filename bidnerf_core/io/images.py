@@ -244,7 +244,7 @@ def _is_deep_colour(image: Image.Image) -> bool:
     tiles = getattr(image, "tile", [])
     arguments = tiles[0][3] if tiles else ""
     raw = arguments[0] if isinstance(arguments, tuple) and arguments else arguments
-    return image.mode in ("LA", "RGB", "RGBA") and isinstance(raw, str) and ";16" in raw
+    return image.mode in ("LA", "RGB", "RGBA", "RGBX") and isinstance(raw, str) and ";16" in raw
 
 
 def _pixels(path: ImageSource, image: Image.Image) -> np.ndarray:
@@ -260,10 +260,13 @@ def _pixels(path: ImageSource, image: Image.Image) -> np.ndarray:
             raise InputError(
                 "not readable as an image with 16 bits per channel", where=path, expected="a complete image file"
             )
-        return cv2.cvtColor(deep, cv2.COLOR_BGR2RGB if deep.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
+        colours = cv2.cvtColor(deep, cv2.COLOR_BGR2RGB if deep.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
+        # A fourth band of a TIFF file is alpha only if it is said to be (ExtraSamples), not infrared for example.
+        extra = getattr(image, "tag_v2", {338: (2,)}).get(338) or (0,)
+        return colours if extra[0] in (1, 2) else colours[..., :3]
     if image.mode in ("P", "PA", *CONVERTED):
         image = image.convert("RGBA" if image.has_transparency_data else "RGB")
-    pixels = np.array(image)
+    pixels = np.array(image.convert("RGB") if image.mode == "RGBX" else image)
     # Pillow before 11.3 decodes a 16-bit PNG to 32 bits. Other images of 32 bits are stored that way, and are rejected later.
     return pixels.astype(np.uint16) if image.format == "PNG" and pixels.dtype == np.int32 else pixels
 

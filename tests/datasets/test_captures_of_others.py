@@ -36,6 +36,7 @@ from scan_layouts import (
     write_opensfm,
     write_polycam,
     write_scannet,
+    write_scannet_pp,
     write_stray_scanner,
     write_video,
 )
@@ -158,6 +159,7 @@ READ: dict[str, tuple[Write, str]] = {
         "masks lies beside the images",
     ),
     "times in nanoseconds": (nanoseconds, ""),
+    "ScanNet++": (lambda root: write_scannet_pp(root, small_views(COUNT)), ""),
 }
 
 
@@ -199,6 +201,9 @@ def test_metashape_joins_components_and_rigs_and_leaves_out_what_is_not_connecte
     torch.testing.assert_close(both[1].T_world_camera.matrix(), expected.matrix(), atol=1e-9, rtol=0)
     apart = in_metashape(lambda x: x.replace('<camera id="1"', '<camera id="1" component_id="2"'), tmp_path / "b")
     assert len(apart) == 1
+    assert [text.rpartition(": ")[2] for text in remarks_of(tmp_path / "b")] == [
+        "its components are not connected; the largest is used, with 1 image"
+    ]
     sensor = '<sensor id="1" type="frame"><resolution width="16" height="12"/><rotation>0 -1 0 1 0 0 0 0 1</rotation><location>1 2 3</location><calibration><f>20</f></calibration></sensor></sensors>'
     slave = re.compile(r'<camera id="1" sensor_id="0"([^>]*)><transform>.*?</transform>')
     rig = in_metashape(

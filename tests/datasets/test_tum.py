@@ -173,6 +173,11 @@ TRAJECTORIES: dict[str, tuple[str, Callable[[float, SE3], str]]] = {
 }
 
 
+def test_nanoseconds_may_have_a_fraction(tmp_path: Path) -> None:
+    (tmp_path / "path.txt").write_text("1403636579763555584.0 0 0 0 0 0 0 1\n")
+    assert read_trajectory(tmp_path / "path.txt").times.tolist() == pytest.approx([1403636579.7635556])
+
+
 @pytest.mark.parametrize("kind", TRAJECTORIES)
 def test_trajectories_of_other_kinds(kind: str, folder: Path) -> None:
     frames = [(timed.time, timed.truth) for timed in open_sequence(folder)]

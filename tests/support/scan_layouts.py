@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import warnings
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
@@ -129,6 +130,17 @@ def write_unpacked_record3d(folder: Path, views: Sequence[View]) -> Path:
     for name, content in record3d_files(views).items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(content)
+    return folder
+
+
+def write_record3d_of_exr(folder: Path, views: Sequence[View]) -> Path:
+    """Write the export as EXR files, of which depth is not read."""
+    for name, content in record3d_files(views).items():
+        if name == "metadata" or name.endswith(".jpg"):
+            file = folder / name.replace("metadata", "metadata.json").replace("rgbd", "rgb")
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(content)
+    (folder / "depth").mkdir()
     return folder
 
 
@@ -314,6 +326,17 @@ def edit_frame(file: Path, number: int = 1, **changes: Any) -> None:
     frames = json.loads(file.read_text())["frames"]
     frames[number] = {k: v for k, v in (frames[number] | changes).items() if v is not None}
     edit_keys(file, frames=frames)
+
+
+def write_scannet_pp(folder: Path, views: Sequence[View]) -> Path:
+    """Write a scene of ScanNet++, whose last image is the test, beside undistorted copies of the images."""
+    data = write_nerfstudio(folder / "dslr/nerfstudio", views)
+    frames = json.loads((data / "transforms.json").read_text())["frames"]
+    named = [{**frame, "file_path": Path(frame["file_path"]).name, "depth_file_path": None} for frame in frames]
+    edit_keys(data / "transforms.json", frames=named[:-1], test_frames=named[-1:])
+    shutil.copytree(data / "images", folder / "dslr/resized_undistorted_images")
+    (data / "images").rename(folder / "dslr/resized_images")
+    return folder
 
 
 def write_colmap(folder: Path, views: Sequence[View], binary: bool = False) -> Path:
@@ -523,6 +546,7 @@ class Layout(NamedTuple):
 LAYOUTS = {
     "record3d": Layout("record3d", write_record3d, times=True, lossless=False),
     "record3d, unpacked": Layout("record3d", write_unpacked_record3d, times=True, lossless=False),
+    "record3d, EXR": Layout("record3d", write_record3d_of_exr, depth=False, times=True, lossless=False),
     "polycam": Layout("polycam", write_polycam, times=True, lossless=False),
     "polycam, not corrected": Layout("polycam", partial(write_polycam, corrected=False), times=True, lossless=False),
     "stray-scanner": Layout("stray-scanner", write_stray_scanner, times=True, lossless=False),

@@ -12,6 +12,8 @@ from the file's), ``transform_matrix``, ``depth_file_path`` or instant-ngp's ``d
 and of any size; each pixel has the depth of the nearest measurement; see ``depth_image`` for values that count as not measured),
 ``mask_path`` (an image whose black pixels are not used). If instant-ngp's ``dynamic_mask_NAME.png`` lies beside ``NAME.png``,
 its white pixels are not used.
+A scene of ScanNet++ has ``dslr/nerfstudio/transforms.json``, with the images in ``dslr/resized_images`` and a split "test" in
+``test_frames``.
 The images of fisheye and division lenses (``camera_model`` as in COLMAP, or ``is_fisheye``, with ``k1`` to ``k4``) are undistorted
 on reading; a panorama (EQUIRECTANGULAR) becomes six frames, see ``PANORAMA_FACES``. Frames whose image is missing are left out,
 and so are missing depth images, with a remark that counts them. ``applied_transform`` and ``applied_scale`` record
@@ -33,7 +35,7 @@ from bidnerf_core.camera import Camera, CameraSource, PanoramaFace, camera_of_re
 from bidnerf_core.datasets.capture import Capture, DepthFile, Shot, warn_about
 from bidnerf_core.datasets.file_names import FileNames
 from bidnerf_core.datasets.formats.transforms_json import SPLIT_FILES, FrameRecord, read_splits
-from bidnerf_core.datasets.reader import DatasetOptions, Format
+from bidnerf_core.datasets.reader import DatasetOptions, Format, first_file
 from bidnerf_core.depth import DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import MaskFile
@@ -41,9 +43,11 @@ from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import background_colour, is_file, read_header
 
 
-def _read(path: Path, files: list[Path], options: DatasetOptions) -> Capture:
+def _read(path: Path, folder: Path, options: DatasetOptions) -> Capture:
     """Read the frames and find their files. Raises ``InputError`` if a file is invalid."""
-    listed, names, named = read_splits(path), FileNames(path), FileNames(path, images=options.image_folder)
+    others = [] if folder == path else [folder.parent / "resized_images", folder.parent / "resized_anon_masks"]
+    listed, names = read_splits(folder), FileNames(folder, *others)
+    named = FileNames(folder, *others, images=options.image_folder)
     images, owner = (
         [named.image(frame.record.text("file_path") or "") for frame, _ in listed],
         dict[Path, FrameRecord](),
@@ -94,6 +98,12 @@ def _read(path: Path, files: list[Path], options: DatasetOptions) -> Capture:
     )
 
 
+def _find(path: Path) -> Path | None:
+    """Return the folder of the files: the given one, or that of ScanNet++."""
+    folders = (path, path / "nerfstudio", path / "dslr/nerfstudio")
+    return next((f for f in folders if first_file(f, "transforms.json", *SPLIT_FILES.values())), None)
+
+
 def _camera(frame: FrameRecord, size: tuple[int, int] | None) -> Camera | CameraSource:
     """Return the camera of a frame; without a size in the file, the first image's size is used, since all images share the lens."""
     if size is None and None in (frame.record.size("w"), frame.record.size("h")):
@@ -128,9 +138,9 @@ def _header(image: Path) -> tuple[tuple[int, int] | None, bool]:
 
 
 reader = Format(
-    "NeRF-Synthetic, nerfstudio, instant-ngp, NeRFCapture, KIRI Engine, and datasets that bidnerf writes",
+    "NeRF-Synthetic, nerfstudio, instant-ngp, ScanNet++, NeRFCapture, KIRI Engine, and datasets that bidnerf writes",
     "transforms.json or transforms_train.json, transforms_val.json, transforms_test.json",
-    lambda path: [path / name for name in ("transforms.json", *SPLIT_FILES.values()) if is_file(path / name)],
+    _find,
     _read,
     ["depth_unit", "images"],
     precedence=50,  # datasets of other formats are converted to this one in place

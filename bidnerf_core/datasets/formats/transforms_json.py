@@ -56,6 +56,9 @@ def read_splits(path: Path) -> list[tuple[FrameRecord, tuple[str, ...]]]:
         return [(frame, (split,)) for split in files for frame in read_frames(read_record(files[split]))]
     record = read_record(path / "transforms.json")
     frames, lists = read_frames(record), {split: record.items(f"{split}_filenames") or [] for split in SPLITS}
+    if tests := record.items("test_frames"):  # of ScanNet++
+        tested = read_frames(Record(record.where, {**record.values, "frames": tests}))
+        return [*((frame, ("train",)) for frame in frames), *((frame, ("test",)) for frame in tested)]
     listed = [(split, str(name)) for split in SPLITS for name in lists[split]]
     if not listed:
         return [(frame, ()) for frame in frames]
@@ -83,6 +86,10 @@ def read_frames(file: Record) -> list[FrameRecord]:
             "no frames" if entries is None else "frames is empty",
             expected="a list of objects with file_path and transform_matrix",
         )
+    if (applied := file.items("applied_transform")) is not None:
+        turn = np.array(file.matrix("applied_transform", applied))[:, :3]
+        if np.linalg.det(turn) == 0:
+            raise file.error("applied_transform is singular", expected="a rotation, perhaps with a scale")
     unposed = {number: entry for number, entry in enumerate(entries) if _lacks_pose(entry)}
     if 0 < len(unposed) < len(entries):
         count, first = len(unposed), next(iter(unposed.values())).get("file_path")
