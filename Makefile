@@ -15,7 +15,7 @@ PARALLEL := -n logical --dist loadfile --no-loadscope-reorder
 PYTEST = OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/python -m pytest $(PARALLEL)
 
 # The first interpreter that runs and is recent enough; override with `make PYTHON=...`.
-PYTHON ?= $(shell for python in python3.11 python3 python3.13 python3.12; do \
+PYTHON ?= $(shell for python in python3.11 python3 python3.14 python3.13 python3.12; do \
 	$$python -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$python && break; done)
 
 # Quiet, but downloads of many megabytes show that something goes on. Most modules are never imported: Python compiles those that
@@ -74,7 +74,8 @@ clean: ## remove what these targets made
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/pip:
-	@test -n "$(PYTHON)" || { echo "Python 3.11 or later is needed, and none was found" >&2; exit 1; }
+	@$(or $(PYTHON),false) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
+		{ echo "Python 3.11 or later is needed, and $(if $(PYTHON),$(PYTHON) is not that,none was found)" >&2; exit 1; }
 	@echo "creating $(VENV) with $$($(PYTHON) --version)"
 	@rm -rf $(VENV) && $(PYTHON) -m venv $(VENV)
 	@$(INSTALL) --quiet --upgrade pip # that of Python 3.11 takes twice as long for all the rest
@@ -87,10 +88,10 @@ $(VENV)/.installed-demo: $(REQUIREMENTS) | $(BIN)/pip
 
 $(VENV)/.installed-docs: $(REQUIREMENTS) | $(BIN)/pip
 	@echo "installing bidnerf and what its documentation needs (minutes, the first time)"
-	@$(INSTALL) -e '.[docs]' | $(SHOW_LONG)
+	@$(INSTALL) -e . --group docs | $(SHOW_LONG)
 	@touch $@
 
 $(VENV)/.installed-dev: $(REQUIREMENTS) | $(BIN)/pip
 	@echo "installing bidnerf, what it needs and what its tests need (minutes, the first time)"
-	@$(INSTALL) -e '.[dev]' -e plugins/bidnerf-scanner-app | $(SHOW_LONG)
+	@$(INSTALL) -e '.[all]' --group dev -e plugins/bidnerf-scanner-app | $(SHOW_LONG)
 	@touch $@ $(VENV)/.installed-demo $(VENV)/.installed-docs

@@ -28,6 +28,7 @@ from bidnerf.cli.parser import Group, Option, Without
 from bidnerf.cli.running import display_progress, interruptible_work
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, amount
+from bidnerf_core.installation import import_extra
 from bidnerf_core.settings import EXPERT, LARGEST_SEED, WholeNumbers
 
 if TYPE_CHECKING:
@@ -149,6 +150,8 @@ def run_evaluate(
         raise UsageError(f"no DATA after map {map}; only closed-form maps have their own data")
     if work.dask is not None and work.workers is not None:
         raise UsageError("--workers and --dask contradict each other: a cluster has its own workers")
+    if work.dask is not None:
+        import_extra("distributed", "cluster", "a cluster")  # before the map is loaded
     plan = starts.plan(
         method,
         images,

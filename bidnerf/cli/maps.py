@@ -54,8 +54,11 @@ def run_info(
         if plot.suffix.lower() != ".png":
             raise UsageError(where=plot, expected="the name of a PNG file")
         check_output(plot, (), overwrite)
-    from bidnerf.results import draw_capture
+    from bidnerf.results import draw_capture, require_matplotlib
     from bidnerf_core.maps import load_map
+
+    if plot is not None:
+        require_matplotlib()
 
     scene = load_map(map)
     if plot is not None:

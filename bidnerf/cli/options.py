@@ -13,6 +13,7 @@ from bidnerf_core import datasets, mapping
 from bidnerf_core.datasets import TEST_IMAGES as TEST_IMAGES
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
+from bidnerf_core.installation import import_extra
 from bidnerf_core.registry import USUAL_FEATURES, USUAL_METHOD, Plugins
 from bidnerf_core.settings import EXPERT, LARGEST_SEED, Above, OneOf, WholeNumbers
 
@@ -230,6 +231,7 @@ class QueryOptions:
         and ``UsageError`` for options that apply only to the other kind.
         """
         from bidnerf_core.datasets import DatasetFrames, Photos, depth_files, photo_files
+        from bidnerf_core.io import is_heif, open_binary
 
         if self.is_dataset(paths):
             if len(paths) > 1:
@@ -244,6 +246,10 @@ class QueryOptions:
         if self.window > 1:
             raise UsageError(f"--window {self.window} needs known relative poses", expected="a dataset")
         files = photo_files(paths, self.depth)
+        for file in filter(Path.is_file, files):
+            with open_binary(file, "an image file") as opened:
+                if is_heif(opened.read(12)):
+                    import_extra("pillow_heif", "heif", "reading HEIC", file, "; or convert the photo to JPEG")
         depth = depth_files(files, self.depth)
         if not self.depth:
             of_depth = {"--depth-unit": images.depth_unit, "--register-depth": images.registration or None}

@@ -1,12 +1,16 @@
-"""The commands ``bidnerf plugins`` and ``bidnerf backends``."""
+"""The commands ``bidnerf plugins``, ``bidnerf backends`` and ``bidnerf doctor``, which describe what is installed."""
 
 from __future__ import annotations
 
-from typing import Annotated
+import platform
+from importlib.metadata import metadata, version
+from typing import Annotated, Any
 
 from bidnerf.cli.options import Json
 from bidnerf.cli.output import print_json, print_table
 from bidnerf.cli.parser import Option
+from bidnerf_core.errors import InputError
+from bidnerf_core.installation import requirements
 from bidnerf_core.registry import GROUPS, PluginInfo, list_plugins
 from bidnerf_core.settings import OneOf
 
@@ -27,6 +31,48 @@ def run_plugins(
 def run_backends(json: Json = False) -> None:
     """List the installed kinds of field."""
     _print_infos(list_plugins("backends"), json)
+
+
+def run_doctor(json: Json = False) -> None:
+    """Describe the installation, as a bug report needs it: versions, devices, extras and plugins.
+
+    The exit status is 1 if a package that bidnerf requires is missing, or has a version that is not supported.
+    """
+    needed = requirements()
+    broken = [requirement for requirement in needed if not requirement.is_met]
+    extras = {
+        name: [each for each in requirements(name) if not each.is_met]
+        for name in metadata("bidnerf").get_all("Provides-Extra") or ()
+        if name != "all"
+    }
+    plugins = [info for group in GROUPS for info in list_plugins(group) if not info.is_bundled or info.fault]
+    found: dict[str, Any] = {
+        "bidnerf": version("bidnerf"),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "devices": [] if broken else _devices(),
+        "packages": {requirement.name: requirement.installed for requirement in needed},
+        "extras": {name: not unmet for name, unmet in extras.items()},
+        "plugins": [f"{GROUPS[info.group]} {info.name}: {info.description}" for info in plugins],
+    }
+    if json:
+        print_json(found)
+    else:
+        rows = [[name, str(found[name])] for name in ("bidnerf", "python", "platform")]
+        rows += [["device", device] for device in found["devices"]]
+        rows += [[requirement.name, requirement.installed or "missing"] for requirement in needed]
+        rows += [[f"extra {name}", ", ".join(map(str, unmet)) or "installed"] for name, unmet in extras.items()]
+        print_table(["", ""], [*rows, *(["plugin", text] for text in found["plugins"])], wide="")
+    if broken:
+        raise InputError(f"{broken[0]}; pip install -U bidnerf")
+
+
+def _devices() -> list[str]:
+    """Return the devices on which fields can compute, with the names of GPUs."""
+    import torch
+
+    gpus = [f"cuda:{i}, {torch.cuda.get_device_name(i)}" for i in range(torch.cuda.device_count())]
+    return ["cpu", *gpus, *(["mps"] if torch.backends.mps.is_available() else [])]
 
 
 def _print_infos(infos: list[PluginInfo], json: bool, *more: str, all_kinds: bool = False) -> None:

@@ -62,7 +62,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:  # a full disk, a folder without write permission
         where = f"{error.filename}: " if error.filename else ""
         return _report(name, f"{where}{error.strerror or error}", BAD_DATA)
-    except InputError as error:
+    except (InputError, ImportError, AttributeError, TypeError) as error:
+        # An unsupported version of a package shows as one of these, or as a plugin that cannot be imported for one of them.
+        if not isinstance(error, InputError) or isinstance(error.__cause__, ImportError | AttributeError | TypeError):
+            from bidnerf_core.installation import requirements
+
+            for requirement in requirements():
+                if not requirement.is_met:
+                    return _report(name, f"{requirement}; pip install -U bidnerf ({error})", BAD_DATA)
+        if not isinstance(error, InputError):
+            raise
         return _report(name, str(error), WRONG_USAGE if isinstance(error, UsageError) else BAD_DATA)
     except RuntimeError as error:
         if type(error).__name__ != "OutOfMemoryError":  # torch's class; importing torch would delay --help

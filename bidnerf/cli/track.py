@@ -26,6 +26,7 @@ from bidnerf.cli.running import display_progress
 from bidnerf.cli.signals import defer_interruptions
 from bidnerf_core import localization
 from bidnerf_core.errors import InputError, UsageError, amount
+from bidnerf_core.installation import import_extra
 from bidnerf_core.registry import USUAL_METHOD
 from bidnerf_core.settings import EXPERT, WholeNumbers
 
@@ -88,6 +89,7 @@ def run_track(
     following ones are searched for in the whole map. If the sequence has true poses, a table shows the errors.
     """
     from bidnerf.results import Answers, check_pose_file, read_pose, require_matplotlib, track
+    from bidnerf_core.datasets import is_video
     from bidnerf_core.localization import Localizer, Tracker, settings_of
     from bidnerf_core.maps import load_map
 
@@ -101,6 +103,8 @@ def run_track(
         check_output(file, [Path(each) for each in named if isinstance(each, str | Path)], overwrite)
     require_device(device)
     require_inputs(sequence, tracking.start)
+    if is_video(sequence):
+        import_extra("av", "video", "reading a video", sequence, "; or extract its frames to a folder")
     start = None if tracking.start is None else read_pose(tracking.start)
     with wrong_usage():
         settings = settings_of(USUAL_METHOD, {"depth_sensor": frames.depth_sensor, "risk": tracking.risk})

@@ -57,11 +57,11 @@ def write_report(
     listed trials are shown. An earlier report in the folder is replaced. Raises ``InputError`` without results
     or matplotlib, for a folder that holds anything but a report, and for a dataset that cannot be read.
     """
+    require_matplotlib()
     if not table.rows:
         raise InputError("no finished trial, nothing to report")
     folder = Path(folder)
     chosen = choose_criterion(criterion, table.groups)
-    require_matplotlib()
     path = folder / "index.html"
     is_ours = path.is_file() and MARK.encode() in path.read_bytes()[:4096]  # the head of the page
     if folder.is_dir() and not is_ours and not all(is_temporary(file.name) for file in folder.iterdir()):

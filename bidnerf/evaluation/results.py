@@ -33,6 +33,7 @@ from bidnerf.evaluation.trial import TrialResult, read_result
 from bidnerf.results import CRITERIA
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.geometry import symbol
+from bidnerf_core.installation import with_writer
 from bidnerf_core.io import (
     FileInUse,
     from_plain,
@@ -145,10 +146,7 @@ def _parse(path: Path, content: bytes) -> tuple[list[TrialResult], int]:
             try:
                 results.append(read_result(plain, where))
             except InputError as error:
-                if (writer := _newer_writer(path)) is None:
-                    raise
-                mine = f"results of bidnerf {version('bidnerf')} or earlier; these were written by bidnerf {writer}"
-                raise InputError(error.found, where=error.where, expected=mine) from error
+                raise with_writer(error, *_writers(path)) from error
         length += len(line) + (number < len(lines))
     return results, length
 
@@ -300,15 +298,11 @@ def note_run(results: Path, run: Provenance) -> None:
     write_file(results.with_suffix(RUNS), (json.dumps({"runs": to_plain(runs)}, indent=1) + "\n").encode())
 
 
-def _newer_writer(results: Path) -> str | None:
-    """Return the version of bidnerf that wrote a results file, if it is newer than this one and recorded next to the file."""
+def _writers(results: Path) -> list[Any]:
+    """Return the versions of bidnerf that wrote a results file, as far as they are recorded next to it."""
     with suppress(InputError, KeyError, TypeError):  # no record of the runs, or another one
-        for run in read_record(results.with_suffix(RUNS)).items("runs") or ():
-            written = str(run["versions"]["bidnerf"])
-            numbers = [[int(part) for part in re.findall(r"\d+", each)] for each in (written, version("bidnerf"))]
-            if numbers[0] > numbers[1]:
-                return written
-    return None
+        return [run["versions"]["bidnerf"] for run in read_record(results.with_suffix(RUNS)).items("runs") or ()]
+    return []
 
 
 def read_runs(results: Path) -> list[Provenance]:

@@ -36,6 +36,7 @@ from bidnerf.evaluation.trial import (
 from bidnerf_core.datasets import Capture
 from bidnerf_core.errors import Cancelled, InputError, amount
 from bidnerf_core.fields import device_of
+from bidnerf_core.installation import import_extra
 from bidnerf_core.io import usable_cores
 from bidnerf_core.localization import find_method
 from bidnerf_core.maps import Map, ViewSource
@@ -276,12 +277,9 @@ def executor_of(workers: Workers, trials: int, on_cpu: bool) -> Iterator[tuple[E
     Raises ``InputError`` for a number below 1, if dask is missing, and if no scheduler or worker responds.
     """
     if isinstance(workers, str):
+        distributed = import_extra("distributed", "cluster", "a cluster")
         try:
-            from distributed import Client
-
-            client = Client(workers, timeout=PATIENCE, set_as_default=False)
-        except ImportError as error:
-            raise InputError("a cluster needs dask, which is missing: pip install 'bidnerf[cluster]'") from error
+            client = distributed.Client(workers, timeout=PATIENCE, set_as_default=False)
         except (OSError, ValueError) as error:  # TimeoutError is an OSError
             raise InputError(
                 f"no dask scheduler at {workers} ({error})", expected="one such as tcp://host:8786"

@@ -36,6 +36,7 @@ from bidnerf_core.datasets import (
 )
 from bidnerf_core.depth import DepthImage, depth_image
 from bidnerf_core.errors import InputError
+from bidnerf_core.installation import import_extra
 from bidnerf_core.io import Archive, ImageSource, Record, is_file, parse_record, read_file
 
 EXPECTED_RECORDING = "a Record3D recording (.r3d)"
@@ -60,11 +61,7 @@ def _read(path: Path, metadata_file: Path, options: DatasetOptions) -> Capture:
     frames = range(len(poses))
     depths = [file(f"rgbd/{number}.depth") for number in frames]
     if has_depth := any(map(_exists, depths)):
-        try:
-            import lzfse  # noqa: F401
-        except ImportError as error:
-            install = "pip install 'bidnerf[record3d]', or pip install lzfse"
-            raise InputError(f"reading Record3D depth needs the package lzfse: {install}", where=path) from error
+        import_extra("lzfse", "record3d", "reading depth of Record3D", path)
     elif (path / "depth").is_dir():
         warn_about(path / "depth", "depth in EXR files is not read; export the recording as .r3d to use its depth")
     cameras, times, read_depth = _cameras(metadata, len(poses)), _times(metadata, len(poses)), lidar.LidarDepth()

@@ -30,6 +30,7 @@ from bidnerf_core.captures import UpDirection, given_cameras
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3, LengthUnit, fit_similarity, symbol
+from bidnerf_core.installation import import_extra
 from bidnerf_core.io import write_file
 from bidnerf_core.localization import (
     Localization,
@@ -298,10 +299,7 @@ class Answers:
         (``qx`` ...), the standard deviations ``sigma_translation`` and ``sigma_rotation_deg``, and, where the truth is known, the
         errors ``error_translation`` and ``error_rotation_deg``. Raises ``InputError`` if pandas is not installed.
         """
-        try:
-            import pandas
-        except ImportError as error:
-            raise InputError("a table needs pandas (pip install pandas)") from error
+        pandas = import_extra("pandas", "pandas", "a table of answers")
         rows = []
         for each in self.given:
             row = {k: v for k, v in self.plain(each).items() if not isinstance(v, list | dict)}

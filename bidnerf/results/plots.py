@@ -23,6 +23,7 @@ from bidnerf_core.captures import (
 from bidnerf_core.devices import move_to
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.geometry import SE3, LengthUnit
+from bidnerf_core.installation import import_extra
 from bidnerf_core.io import write_file
 from bidnerf_core.mapping import SurfaceMap
 
@@ -38,11 +39,7 @@ CRITERION_NAMES = {
 
 def require_matplotlib() -> Any:
     """Return matplotlib. Raises ``InputError`` if this optional dependency is not installed."""
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise InputError("plots need matplotlib, which is missing: pip install 'bidnerf[plots]'") from error
-    return matplotlib
+    return import_extra("matplotlib", "plots", "drawing a plot")
 
 
 def common_style() -> Any:

@@ -10,7 +10,6 @@ from .queue import RequestQueue as RequestQueue
 from .queue import ThreadExecutor as ThreadExecutor
 from .server import PORT as PORT
 from .server import choose_token as choose_token
-from .server import require_server as require_server
 from .server import run_app as run_app
 from .server import serve as serve
 from .server import service_app as service_app

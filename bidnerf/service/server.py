@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from bidnerf.service.settings import ServiceLimits, check_token
 from bidnerf_core.errors import InputError, UsageError
+from bidnerf_core.installation import import_extra
 from bidnerf_core.settings import to_flat
 
 if TYPE_CHECKING:
     from bidnerf.service.web import Application
 
 PORT = 8000
-NEEDS = "the service needs the extra 'serve' (pip install 'bidnerf[serve]')"
 
 
 Scenes: TypeAlias = str | Path | Sequence[str | Path] | Mapping[str, str | Path]
@@ -46,7 +46,7 @@ def service_app(
     only requests addressed to localhost are answered. Raises ``InputError`` for invalid names and settings, and if
     the extra ``serve`` is not installed. ASGI startup raises ``InputError`` if a map cannot be loaded.
     """
-    require_server(NEEDS)
+    import_extra("uvicorn", "serve", "the service")
     from bidnerf.service.app import application
 
     if config is not None and not isinstance(config, Mapping) and not is_dataclass(config):
@@ -83,20 +83,10 @@ def serve(
     """
     if not hasattr(os, "fork"):
         raise InputError("this system has no fork, but workers share the maps' memory by forking; use Linux or macOS")
-    require_server(NEEDS)
+    import_extra("uvicorn", "serve", "the service")
     token = choose_token(host, token)
     app = service_app(scenes, token=token, **options)
     run_app(app, host, port, lambda address: ready and ready(address, token), stop)
-
-
-def require_server(needs: str) -> None:
-    """Raise ``InputError`` with the text ``needs`` if the web server is not installed."""
-    try:
-        import uvicorn  # noqa: F401 (only tried)
-
-        import bidnerf.service.web  # noqa: F401
-    except ImportError as error:
-        raise InputError(needs) from error
 
 
 def choose_token(host: str | None, token: str | None) -> str | None:

@@ -32,6 +32,7 @@ from bidnerf_core.camera import (
 )
 from bidnerf_core.datasets import Capture, Shot
 from bidnerf_core.errors import InputError, amount
+from bidnerf_core.installation import import_extra
 from bidnerf_core.io import read_header, read_image
 from bidnerf_core.mapping import Keypoints, Sift, Vocabulary
 from bidnerf_core.progress import counter
@@ -53,23 +54,9 @@ def import_pycolmap(what: str) -> Any:
 
     Raises ``InputError`` if pycolmap is missing or too old; the message begins with ``what``.
     """
-    try:
-        import pycolmap
-
-        if (
-            threading.current_thread() is threading.main_thread()
-        ):  # pycolmap's handler prints a stack and ends the process
-            signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
-    except ImportError as error:
-        raise InputError(
-            "finding the poses of photos needs the extra 'sfm' (pip install 'bidnerf[sfm]')", where=what
-        ) from error
-    if not hasattr(pycolmap, "CancellationToken"):  # a name that exists from 4.2 on
-        raise InputError(
-            f"pycolmap is {pycolmap.__version__}",
-            where=what,
-            expected="4.2 or later (pip install -U 'bidnerf[sfm]')",
-        )
+    pycolmap = import_extra("pycolmap", "sfm", "finding the poses of photos", what)
+    if threading.current_thread() is threading.main_thread():  # pycolmap's handler prints a stack and ends the process
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     return pycolmap
 

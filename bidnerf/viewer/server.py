@@ -6,20 +6,18 @@ import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from bidnerf.service import ServiceLimits, choose_token, require_server, run_app
+from bidnerf.service import ServiceLimits, choose_token, run_app
+from bidnerf_core.installation import import_extra
 
 if TYPE_CHECKING:
     from bidnerf.viewer.app import LiveView
 
 VIEWER_PORT = 8010
-VIEWER_NEEDS = (
-    "the live viewer needs the extra 'viewer' (pip install 'bidnerf[viewer]'); `save` writes a page without it"
-)
 
 
 def require_viewer() -> None:
     """Raise ``InputError`` if the extra ``viewer`` is not installed; callers need not load a map before they know."""
-    require_server(VIEWER_NEEDS)
+    import_extra("uvicorn", "viewer", "the live viewer", otherwise="; `save` writes a page without it")
 
 
 def serve_view(

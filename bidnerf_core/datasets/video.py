@@ -18,6 +18,7 @@ from torch import Tensor
 
 from bidnerf_core.datasets.capture import BreaksOff
 from bidnerf_core.errors import InputError
+from bidnerf_core.installation import import_extra
 from bidnerf_core.io import LARGEST_IMAGE, looks_like_image, open_binary, reason
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".3gp", ".ts", ".mts")
@@ -145,13 +146,7 @@ def _open_stream(path: Path) -> Iterator[tuple[Any, Any]]:
 
     Raises ``InputError`` if it is not a video, and, with what to install, if the extra ``video`` is missing.
     """
-    try:
-        import av
-    except ImportError as error:
-        raise InputError(
-            "reading a video needs the extra 'video' (pip install 'bidnerf[video]'); or extract its frames to a folder",
-            where=path,
-        ) from error
+    av = import_extra("av", "video", "reading a video", path, "; or extract its frames to a folder")
     try:
         with av.open(str(path.resolve()), options=OPTIONS) as container:
             if not container.streams.video:

@@ -18,6 +18,7 @@ from urllib.parse import quote
 import numpy as np
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.installation import import_extra
 from bidnerf_core.io.allowance import Allowance
 from bidnerf_core.io.files import open_binary, reason
 
@@ -65,10 +66,7 @@ def open_arrays(path: Path, expected: str) -> Iterator[Callable[..., np.ndarray 
     briefly describes the file.
     """
     open_binary(path, expected).close()
-    try:
-        import h5py
-    except ImportError as error:
-        raise InputError(f"{expected} need h5py (pip install h5py)", where=path) from error
+    h5py = import_extra("h5py", "hloc", f"reading {expected}", path)
     allowance = Allowance.of(path, expected)
 
     def read(*names: str) -> np.ndarray | None:

@@ -19,6 +19,7 @@ from PIL import Image, TiffImagePlugin, UnidentifiedImageError, WebPImagePlugin 
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.installation import import_extra
 from bidnerf_core.io.allowance import Allowance
 from bidnerf_core.io.files import PackedFile, open_binary, reason
 
@@ -287,14 +288,8 @@ def open_image(path: ImageSource) -> Iterator[Image.Image]:
         )
     with open_binary(path, "an image file") as file:
         if is_heif(file.read(12)):
-            try:
-                import pillow_heif
-            except ImportError as error:
-                raise InputError(
-                    "is HEIC, which needs the package pillow-heif (pip install pillow-heif); or convert the photo to JPEG",
-                    where=path,
-                ) from error
-            pillow_heif.register_heif_opener()
+            heif = import_extra("pillow_heif", "heif", "reading HEIC", path, "; or convert the photo to JPEG")
+            heif.register_heif_opener()
         file.seek(0)
         _check_segments(path, file)
         Image.preinit()

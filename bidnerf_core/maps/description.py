@@ -16,6 +16,7 @@ from bidnerf_core.captures import PoseRefinement, StoredCamera, cameras_with_inv
 from bidnerf_core.errors import InputError, InputWarning, enumeration
 from bidnerf_core.fields import RadianceField, SceneBounds, scale_field
 from bidnerf_core.geometry import SE3, LengthUnit, pose_from_matrix, scale_point
+from bidnerf_core.installation import with_writer
 from bidnerf_core.io import from_plain, read_json
 from bidnerf_core.mapping import USUAL_FEATURES
 from bidnerf_core.settings import Above, NotNegative, Range, Settings
@@ -165,26 +166,26 @@ def load_info(folder: Path) -> MapInfo:
     found = read_json(path, "the description of a map")
     if not isinstance(found, dict) or found.get("format") != "bidnerf map":
         raise InputError("not the description of a map", where=path, expected='"format": "bidnerf map"')
+    writer = found.get("bidnerf")
     if found.get("version") != VERSION:
         newer = isinstance(found.get("version"), int) and found["version"] > VERSION
-        raise InputError(
-            f"version {found.get('version')!r}",
-            where=path,
-            expected=f"{VERSION}; {'it was written by a newer bidnerf; upgrade bidnerf' if newer else 'retrain the map'}",
-        )
+        expected = f"{VERSION}; {'it was written by a newer bidnerf; upgrade bidnerf' if newer else 'retrain the map'}"
+        raise with_writer(InputError(f"version {found.get('version')!r}", where=path, expected=expected), writer)
     for part in PART_NAMES:
         name = found.get(part)
         if isinstance(name, str) and (not name or Path(name).name != name):
             raise InputError(f"names {name!r}", where=path, expected="the name of a file next to it")
     if unknown := sorted(found.keys() - {part.name for part in fields(MapInfo)}):
         warnings.warn(
-            f"{path}: ignored {enumeration(unknown)}, which this bidnerf does not know; the map was written by bidnerf"
-            f" {found.get('bidnerf')}",
+            f"{path}: ignored {enumeration(unknown)}, which bidnerf {version('bidnerf')} does not know; bidnerf {writer} wrote the map",
             InputWarning,
             stacklevel=2,
         )
         found = {key: value for key, value in found.items() if key not in unknown}
-    info = from_plain(MapInfo, found, str(path))
+    try:
+        info = from_plain(MapInfo, found, str(path))
+    except InputError as error:
+        raise with_writer(error, writer) from error
     if (folder / ANCHOR).exists():
         info = replace(
             info, anchor=from_plain(Anchor, read_json(folder / ANCHOR, "the anchor of a map"), str(folder / ANCHOR))

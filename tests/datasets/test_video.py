@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import sys
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -150,12 +149,6 @@ def test_files_that_are_no_video(content: bytes, tmp_path: Path) -> None:
     file.write_bytes(content)
     with refused(where=file, found="not readable as a video", expected="a video file"):
         open_sequence(file, focal=50)
-
-
-def test_a_missing_extra_is_named(clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "av", None)
-    with refused(where=clip, found="the extra 'video' (pip install 'bidnerf[video]')"):
-        open_sequence(clip, focal=50)
 
 
 @pytest.mark.parametrize(

@@ -43,7 +43,7 @@ def test_results_of_a_newer_version_name_it(tmp_path: Path) -> None:
     row = trial_result(Trial("house", "photos", ("a",)), [1.0]).plain()
     (tmp_path / "r.jsonl").write_text(json.dumps(row | {"ink": 1}) + "\n")
     for versions, expected in (
-        ({"bidnerf": "99.1"}, "these were written by bidnerf 99.1"),
+        ({"bidnerf": "99.1"}, "bidnerf 99.1 wrote it, so upgrade bidnerf"),
         ({"bidnerf": "0.0.1"}, "any of"),
         ({}, "any of"),
     ):

@@ -176,15 +176,6 @@ def test_a_report_of_one_hopeless_trial_without_a_start(tmp_path: Path) -> None:
     assert "no record of how it was made" in read(tmp_path / "out").text
 
 
-def test_without_matplotlib_a_report_tells_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bidnerf: Run
-) -> None:
-    file = write(tmp_path / "r.jsonl", result(0, 2))
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    missing = "matplotlib, which is missing: pip install 'bidnerf[plots]'"
-    assert_refused(bidnerf("report", file, "--out", tmp_path / "out"), 1, missing)
-
-
 def test_figures_are_the_same_each_time(tmp_path: Path, results: list[TrialResult]) -> None:
     first, second = (Figures(group_results(results[:2]), tmp_path / name, "10%").errors() for name in ("a", "b"))
     assert first[0].read_bytes() == second[0].read_bytes()

@@ -217,7 +217,7 @@ def test_features_of_hloc_are_read_with_their_detector(
 ) -> None:
     file = tmp_path / "features.h5"
     file.write_bytes(b"")
-    with refused(where="features.h5", found="need h5py"), monkeypatch.context() as patch:
+    with refused(where="features.h5", found="features of hloc needs the extra 'hloc'"), monkeypatch.context() as patch:
         patch.setitem(sys.modules, "h5py", None)
         bn.import_map(model.folder, None, {"keypoints": str(file)})
     write_features(file, model.keypoints)

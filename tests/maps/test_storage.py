@@ -536,8 +536,12 @@ def test_descriptions_of_what_cannot_be_are_refused(
 
 def test_keys_of_a_newer_version_are_ignored_with_a_warning(tmp_path: Path) -> None:
     described(tmp_path, mirrored=True, bidnerf="99.1")
-    with pytest.warns(InputWarning, match=r"map\.json: ignored mirrored, .* written by bidnerf 99\.1$"):
+    with pytest.warns(InputWarning, match=r"map\.json: ignored mirrored, .*; bidnerf 99\.1 wrote the map$"):
         assert load_info(tmp_path).bidnerf == "99.1"
+    for changes, fault in (({"version": 2}, "version 2"), ({"step": "many"}, "found 'many'")):
+        described(tmp_path, bidnerf="99.1", **changes)
+        with refused(where="map.json", found=fault, expected="or earlier; bidnerf 99.1 wrote it, so upgrade bidnerf"):
+            load_info(tmp_path)
 
 
 def test_a_training_of_any_length_is_described(bidnerf: Run, tmp_path: Path) -> None:

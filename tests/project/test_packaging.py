@@ -20,7 +20,8 @@ pytestmark = pytest.mark.slow
 
 
 ROOT = Path(__file__).parents[2]
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+DECLARED = tomllib.loads((ROOT / "pyproject.toml").read_text())
+PROJECT = DECLARED["project"]
 BACKENDS, METHODS = (PROJECT["entry-points"][f"bidnerf.{group}"] for group in ("backends", "methods"))
 STOREYS = ["bidnerf", "bidnerf_core"]
 PACKAGES = [*STOREYS, *sorted({re.split("[.:]", value)[0] for value in (BACKENDS | METHODS).values()} - {*STOREYS})]
@@ -124,10 +125,11 @@ def test_every_bundled_backend_is_packaged_and_declared() -> None:
 
 
 def test_what_is_required_is_pinned() -> None:
-    """``constraints.txt`` has an exact version of each requirement of the core, of the tests and of the demo."""
+    """``constraints.txt`` has an exact version of each requirement, of the extras' and of the development's."""
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pinned = {line.partition("==")[0].lower().replace("_", "-") for line in lines if "==" in line}
-    extras = PROJECT["optional-dependencies"]
-    required = [*PROJECT["dependencies"], *extras["dev"], *extras["plots"], *extras["cluster"]]
+    groups = [entry for group in DECLARED["dependency-groups"].values() for entry in group if isinstance(entry, str)]
+    extras = [entry for group in PROJECT["optional-dependencies"].values() for entry in group]
+    required = [entry for entry in [*PROJECT["dependencies"], *extras, *groups] if not entry.startswith("bidnerf[")]
     names = {re.split(r"[\[>=]", entry)[0] for entry in required}
     assert {name.lower().replace("_", "-") for name in names} <= pinned

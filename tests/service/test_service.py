@@ -50,7 +50,6 @@ from bidnerf.service.models import LocalizationBody, MapFacts, PhotoForm
 from bidnerf.service.pool import Pool
 from bidnerf.service.server import maps_by_name
 from bidnerf.service.web import SAFE, Gate
-from bidnerf.viewer import require_viewer
 from bidnerf_core.camera import WAYS
 from bidnerf_core.localization import settings_of
 from bidnerf_core.registry import _declared
@@ -826,13 +825,6 @@ async def unmanaged(app: Any) -> AsyncIterator[None]:
 def test_the_listening_process_does_not_load_torch() -> None:
     program = "import sys; from bidnerf.service import service_app; service_app('MAP').openapi(); print('torch' in sys.modules)"
     assert subprocess.check_output([sys.executable, "-c", program], text=True) == "False\n"
-
-
-@pytest.mark.parametrize(("server", "needed"), [(service_app, "serve"), (require_viewer, "viewer")])
-def test_a_server_that_is_not_installed_is_named(server: Any, needed: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "uvicorn", None)
-    with pytest.raises(InputError, match=rf"bidnerf\[{needed}\]"):
-        server(*["MAP"] if needed == "serve" else [])
 
 
 def test_startup_of_another_server_starts_the_pool(monkeypatch: pytest.MonkeyPatch) -> None:
