@@ -23,7 +23,7 @@ from bidnerf_core.depth import MILLIMETRE
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import is_file, read_rows
 
-LAYOUT = Layout(
+ACE = Layout(
     (("train/rgb", "val/rgb", "test/rgb"), ("rgb",)),
     pose=("../poses/{name}.txt", "../pose/{name}.txt"),
     camera=("../calibration/{name}.txt", "../intrinsics.txt"),
@@ -35,7 +35,7 @@ PREFIXES = {"0": "train", "1": "val", "2": "test"}
 def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
     """Read the poses and calibrations. Raises ``InputError`` if one is invalid."""
     unit, has_digits, shots = options.depth_unit or MILLIMETRE, is_file(path / "intrinsics.txt"), list[Shot]()
-    for image, shot in zip(images, LAYOUT.shots(images, partial(read_matrix, first_centre=0), unit), strict=True):
+    for image, shot in zip(images, ACE.shots(images, partial(read_matrix, first_centre=0), unit), strict=True):
         digit, part = shot.stem.partition("_")[0] if has_digits else "", image.parents[1]
         split = PREFIXES.get(digit) if part == path else part.name
         shots.append(replace(shot, splits=(split,) if split and shot.T_world_camera else ()))
@@ -71,7 +71,7 @@ def read_matrix(file: Path, size: tuple[int, int], first_centre: float = 0.5) ->
 reader = Format(
     "ACE, DSAC* and Wayspots, and NSVF: one pose file an image, with splits, depth in millimetres",
     "train/rgb, train/poses and train/calibration (ACE), or rgb, pose and intrinsics.txt (NSVF)",
-    LAYOUT.images,
+    ACE.images,
     _read,
     ["depth_unit"],
     precedence=30,  # poses are metric or were scaled on purpose

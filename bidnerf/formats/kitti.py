@@ -30,7 +30,7 @@ from bidnerf_core.errors import InputError, amount
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import is_file, read_header, read_rows
 
-LAYOUT = Layout(
+KITTI = Layout(
     tuple((f"image_{number}",) for number in (2, 0, 3, 1)),  # the left colour camera first
     image=r"(\d+)\.\w+",
     camera=("../calib.txt",),
@@ -50,7 +50,7 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
     if gone := sorted(set(range(listed)).difference(numbers)):
         warn_about(path, f"{len(gone)} of {amount(listed, 'image')} are missing, first: number {gone[0]}")
     by_name = {i.stem: poses[n] for i, n in zip(images, numbers, strict=True) if n < len(poses)}
-    shots = LAYOUT.shots(images, camera, poses=by_name)
+    shots = KITTI.shots(images, camera, poses=by_name)
     times = [rows[number].numbers(count=1)[0] if number < len(rows) else None for number in numbers]
     shots = [replace(shot, time=time) for shot, time in zip(shots, times, strict=True)]
     return Capture(
@@ -75,7 +75,7 @@ def _calibration(file: Path, camera: str, size: tuple[int, int]) -> tuple[Intrin
 reader = Format(
     "KITTI odometry: poses of poses.txt or ../../poses/NN.txt, times of times.txt",
     "calib.txt with image_2 or image_0 (KITTI odometry)",
-    LAYOUT.images,
+    KITTI.images,
     _read,
     may_lack_poses=True,
     precedence=30,  # a recording with metric poses

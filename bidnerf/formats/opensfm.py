@@ -34,7 +34,6 @@ from bidnerf_core.io import Record, read_json
 
 PROJECTIONS = ("perspective", "brown", "simple_radial", "radial", "fisheye_opencv")
 """The projection types that are read, besides panoramas."""
-POSE_KEYS = ("rotation", "translation")
 
 
 def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
@@ -57,7 +56,9 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
             raise record.error(f"has the camera {key[:60]!r}", expected="one of cameras")
         if key not in known:
             known[key] = _camera(Record(f"{record.where}: camera", own))
-        turn, position = ([record.checked_number(n, k) for n in record.items(k) or []] for k in POSE_KEYS)
+        turn, position = (
+            [record.checked_number(n, k) for n in record.items(k) or []] for k in ("rotation", "translation")
+        )
         if not len(turn) == len(position) == 3:
             raise record.error("has no pose", expected="rotation and translation of 3 numbers each")
         rotation = torch.from_numpy(Rotation.from_rotvec(turn).as_matrix())

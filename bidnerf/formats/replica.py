@@ -20,7 +20,7 @@ from bidnerf_core.io import Record, read_record, read_rows
 CAMERA_KEYS = ("fx", "fy", "cx", "cy", "scale")
 
 
-LAYOUT = Layout(
+REPLICA = Layout(
     (("results",),), image=r"(frame[^.]*)\..+", pose=("../traj.txt",), depth=("depth{number}.png",), unmeasured=()
 )
 
@@ -35,7 +35,7 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
     file = first_file(path, "cam_params.json", f"{path.resolve().parent}/cam_params.json")
     camera, step = (Intrinsics(600, 600, 600, 340, 1200, 680), 1 / 6553.5) if file is None else _camera(file)
     unit = options.depth_unit or step
-    shots = LAYOUT.shots(images, camera, unit, poses={i.stem: T for i, T in zip(images, poses, strict=True)})
+    shots = REPLICA.shots(images, camera, unit, poses={i.stem: T for i, T in zip(images, poses, strict=True)})
     return Capture(path, shots, options.colour, "metres", depth_unit=unit, pose_file=trajectory)
 
 
@@ -53,7 +53,7 @@ def _camera(file: Path) -> tuple[Intrinsics, float]:
 reader = Format(
     "Replica of iMAP and NICE-SLAM: depth in the steps of cam_params.json",
     "traj.txt with results/frame000000.jpg (Replica)",
-    LAYOUT.images,
+    REPLICA.images,
     _read,
     ["depth_unit"],
     may_lack_poses=True,

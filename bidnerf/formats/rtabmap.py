@@ -27,7 +27,7 @@ from bidnerf_core.depth import MILLIMETRE
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import parse_yaml, read_file, read_rows
 
-LAYOUT = Layout(
+RTABMAP = Layout(
     (("*rgb",),),
     image=r"([^.].*)\.\w+",
     pose=("../{prefix}camera_poses.txt", "../{prefix}poses.txt"),
@@ -39,7 +39,7 @@ LAYOUT = Layout(
 
 def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
     """Read the poses and calibrations. Raises ``InputError`` if one is invalid."""
-    file, unit = LAYOUT.file(LAYOUT.pose, images[0]), options.depth_unit or MILLIMETRE
+    file, unit = RTABMAP.file(RTABMAP.pose, images[0]), options.depth_unit or MILLIMETRE
     poses, times = dict[str, SE3 | None](), dict[str, float]()
     for row in read_rows(file, "poses of RTAB-Map", "timestamp x y z qx qy qz qw id"):
         if len(row.words) not in (8, 9):
@@ -48,13 +48,13 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
         for key in (row.words[0], row.words[-1]):
             poses[key], times[key] = pose_of_numbers(row.where, numbers[1:8], opengl=False), numbers[0]
     if "camera" not in file.name:
-        mounted = {image.stem: _local_transform(LAYOUT.file(LAYOUT.camera, image)) for image in images}
+        mounted = {image.stem: _local_transform(RTABMAP.file(RTABMAP.camera, image)) for image in images}
         poses |= {name: T @ T_robot for name, T_robot in mounted.items() if T_robot and (T := poses.get(name))}
         if any(mounted.values()):
             warn_about(
                 file, "is taken for poses of the robot, from which those of its camera follow by local_transform"
             )
-    shots = LAYOUT.shots(images, read_camera, unit, poses=poses)
+    shots = RTABMAP.shots(images, read_camera, unit, poses=poses)
     shots = [replace(shot, time=times.get(shot.stem)) for shot in shots]
     return Capture(
         path,
@@ -79,7 +79,7 @@ def _local_transform(calibration: Path) -> SE3 | None:
 reader = Format(
     "RTAB-Map: exported images, depth, calibrations and poses of the camera or the robot",
     "rtabmap_rgb with rtabmap_calib and rtabmap_poses.txt (RTAB-Map)",
-    LAYOUT.images,
+    RTABMAP.images,
     _read,
     ["depth_unit"],
     precedence=30,  # a recording with metric poses

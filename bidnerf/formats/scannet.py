@@ -18,7 +18,7 @@ from bidnerf_core.datasets import Capture, DatasetOptions, Format
 from bidnerf_core.depth import MILLIMETRE
 from bidnerf_core.io import is_file, read_header
 
-LAYOUT = Layout(
+SCANNET = Layout(
     (("color",), ("rgb",)),
     pose=("../pose/{name}.txt",),
     camera=tuple(f"../{folder}intrinsic_color.txt" for folder in ("intrinsic/", "", "intrinsics/")),
@@ -28,14 +28,17 @@ LAYOUT = Layout(
 
 def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
     """Read the cameras and poses. Raises ``InputError`` if one is invalid."""
-    calibration, depths = LAYOUT.file(LAYOUT.camera, images[0]), [LAYOUT.file(LAYOUT.depth, image) for image in images]
+    calibration, depths = (
+        SCANNET.file(SCANNET.camera, images[0]),
+        [SCANNET.file(SCANNET.depth, image) for image in images],
+    )
     of_depth, first = calibration.with_name("intrinsic_depth.txt"), next(filter(is_file, depths), None)
     camera = read_matrix(calibration, read_header(images[0]).size)
     depth_camera = read_matrix(of_depth, read_header(first).size) if first is not None and is_file(of_depth) else None
     sensor, unit = options.sensor(path, own_sensor(camera, depth_camera)), options.depth_unit or MILLIMETRE
     return Capture(
         path,
-        LAYOUT.shots(images, camera, unit, sensor),
+        SCANNET.shots(images, camera, unit, sensor),
         options.colour,
         unit="metres",
         depth_unit=unit,
@@ -47,7 +50,7 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
 reader = Format(
     "exported ScanNet: depth in millimetres, registered to the colour camera",
     "color/0.jpg with pose/0.txt and intrinsic/intrinsic_color.txt (ScanNet)",
-    LAYOUT.images,
+    SCANNET.images,
     _read,
     ("register_depth", "depth_unit"),
     may_lack_poses=True,

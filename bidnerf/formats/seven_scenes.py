@@ -52,7 +52,7 @@ T_COLOUR_DEPTH = SE3(
 """Pose of another Kinect's depth camera in its colour camera's frame, as used by ACE's ``setup_7scenes.py``:
 https://projet.liris.cnrs.fr/voir/activities-dataset/kinect-calibration.html."""
 
-LAYOUT = Layout(
+SEVEN_SCENES = Layout(
     (("seq*[0-9]",), (".",)),
     image=r"(frame-\d+)\.color\.(?:png|jpe?g)",
     pose=("{name}.pose.txt",),
@@ -76,7 +76,7 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
             for number in _read_split(file, number_of.values()):
                 splits[number] = *splits.get(number, ()), split
     shots = list[Shot]()
-    for image, shot in zip(images, LAYOUT.shots(images, camera, unit, sensor), strict=True):
+    for image, shot in zip(images, SEVEN_SCENES.shots(images, camera, unit, sensor), strict=True):
         T, own = shot.T_world_camera, splits.get(number_of[image.parent], ())
         if own or not splits:
             shots.append(shot if T is None else replace(shot, T_world_camera=T @ T_depth_colour, splits=own))
@@ -108,7 +108,7 @@ def _read_split(file: Path, known: Collection[int]) -> list[int]:
 reader = Format(
     "7-Scenes: splits of TrainSplit.txt and TestSplit.txt, depth registered to the colour camera",
     "frame-000000.color.png ... in the folder or in seq-01 ... (7-Scenes)",
-    LAYOUT.images,
+    SEVEN_SCENES.images,
     _read,
     ("camera", "register_depth", "depth_unit"),
     may_lack_poses=True,

@@ -15,7 +15,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from bidnerf.formats.seven_scenes import LAYOUT as SEVEN_SCENES
+from bidnerf.formats.seven_scenes import SEVEN_SCENES
 from bidnerf_core.camera import CameraSource, Intrinsics
 from bidnerf_core.datasets import Capture, DatasetOptions, Format, camera_of, first_file, numbers_in, pixel_size
 from bidnerf_core.depth import MILLIMETRE, DepthCamera
@@ -23,14 +23,14 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import read_file, read_rows
 
-LAYOUT = replace(
+TWELVE_SCENES = replace(
     SEVEN_SCENES, folders=(("data",), (".",)), camera=("../info.txt", "../_info.txt", "info.txt", "_info.txt")
 )
 
 
 def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
     """Read the poses and splits. Raises ``InputError`` if a metadata file is invalid."""
-    info, values = LAYOUT.file(LAYOUT.camera, images[0]), dict[str, list[float]]()
+    info, values = TWELVE_SCENES.file(TWELVE_SCENES.camera, images[0]), dict[str, list[float]]()
     for row in read_rows(info, "12-Scenes' info.txt", "name = numbers"):
         name, _, text = row.text.partition("=")
         if name.strip().startswith(("m_calibration", "m_color", "m_depth")):
@@ -41,7 +41,7 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
             "no m_calibrationColorIntrinsic", where=info, expected="16 numbers, with m_colorWidth and m_colorHeight"
         )
     unit, sensor = options.depth_unit or MILLIMETRE, options.sensor(path, own_sensor(colour, depth))
-    shots = LAYOUT.shots(images, CameraSource(options.given_camera or colour), unit, sensor)
+    shots = TWELVE_SCENES.shots(images, CameraSource(options.given_camera or colour), unit, sensor)
     if (file := first_file(path, "split.txt", "../split.txt")) is not None:
         text = read_file(file, "a list of sequences").decode("utf-8", "replace")
         first = re.search(r"start\s*=\s*(\d+)\s*;\s*end\s*=\s*(\d+)", text)
@@ -83,7 +83,7 @@ def _camera(info: Path, values: dict[str, list[float]], kind: str) -> Intrinsics
 reader = Format(
     "12-Scenes: the first sequence of split.txt is the test, depth registered to the colour camera",
     "info.txt with data/frame-000000.color.jpg ... (12-Scenes)",
-    LAYOUT.images,
+    TWELVE_SCENES.images,
     _read,
     ("camera", "register_depth", "depth_unit"),
     precedence=35,  # its images have the names of 7-Scenes' ones
