@@ -30,6 +30,7 @@ from typing import Any
 
 import _lab
 import torch
+from jaxtyping import Float
 from kornia.metrics import psnr, ssim
 from torch import Tensor
 
@@ -41,7 +42,6 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.io import to_plain
 from bidnerf_core.localization import LandmarkMatcher, Loop
 from bidnerf_core.maps import Map, load_map
-from bidnerf_core.training import fit_colours
 
 LEAST_LANDMARKS = 30
 """Minimum number of landmarks from which the pose of a test frame is refined."""
@@ -73,6 +73,18 @@ def train_without_depth(data: Path, out: Path, options: list[str]) -> dict[str, 
         (copy / "transforms_train.json").unlink()
         (copy / "transforms_train.json").write_text(json.dumps(listed))
         return train(copy, out, options)
+
+
+def fit_colours(rgb: Float[Tensor, "*p 3"], photo: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
+    """Apply to ``rgb`` the gain and offset per channel that best fit ``rgb`` to ``photo`` (least squares).
+
+    The gain and offset serve as the colour transform of an image outside the training set.
+    """
+    x, y = rgb.reshape(-1, 3).double(), photo.reshape(-1, 3).double()
+    around = x - x.mean(0)
+    gain = (around * y).sum(0) / around.square().sum(0).clamp(min=1e-12)
+    fitted = (rgb.double() - x.mean(0)) * gain + y.mean(0)
+    return fitted.to(rgb)
 
 
 def judge(field: RadianceField, bounds: SceneBounds, views: list[View]) -> dict[str, float | None]:

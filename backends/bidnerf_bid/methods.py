@@ -77,7 +77,7 @@ def descend_from_start(
     T, mean = poses[-1], recent_loss(losses)
     # How well rays that were not used distinguish the pose from its rivals.
     by_depth = None if depth is None else DepthLossSettings(depth.depth_weight, depth.depth_loss, depth.depth_scale)
-    rays = draw_rays(problem, config.colour, by_depth, RAYS, seed, config.descent.level)
+    rays = draw_rays(problem, config.colour, by_depth, RAYS, seed, config.descent.level_of(problem.field))
     rays = replace(rays, exposure=False)
     middle = middle_of_view(problem, T if bool(T.matrix().isfinite().all()) else None)
     measures = support(lambda T: rays.costs(states_at(T)), T, middle, rays.plain_costs())

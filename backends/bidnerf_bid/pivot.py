@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.fields import render
+from bidnerf_core.fields import levels, render
 from bidnerf_core.frames import View, draw, observe, uniform
 from bidnerf_core.geometry import SE3, skew
 from bidnerf_core.localization import Problem
@@ -88,7 +88,7 @@ def middle_of_view(problem: Problem, T: SE3 | None) -> Float[Tensor, "3"]:
         return torch.zeros(3, dtype=torch.float64)
     # The renderings of 128 rays give the middle of the visible scene.
     some = draw(problem.views, 128, uniform, torch.Generator().manual_seed(0), device=problem.device).flattened()
-    seen = render(problem.level(0), some.rays(T.to(problem.device), problem.bounds), problem.bounds.background)
+    seen = render(levels(problem.field)[0], some.rays(T.to(problem.device), problem.bounds), problem.bounds.background)
     distance = torch.where(seen.opacity > 0.5, seen.distance / seen.opacity.clamp(min=0.5), torch.nan)
     found = (some.origins + distance[..., None] * some.directions).nanmedian(-2).values.cpu().double()
     if bool(found.isfinite().all()):

@@ -34,7 +34,7 @@ class SampledLoss:
 
     def __post_init__(self) -> None:
         problem = self.problem
-        self._field, self._bounds = problem.level(self.rays.level), problem.bounds
+        self._field, self._bounds = self.rays.level_of(problem.field), problem.bounds
         # Extra candidates are worth their cost only if more than 2 % of pixels have the background's colour and no depth.
         self._candidates = 1
         for frame in (view.frame for view in problem.views) if self.reach.candidates > 1 else ():

@@ -15,6 +15,8 @@ from bidnerf_bid.residuals import (
     free_space_term,
     opacity_term,
 )
+from bidnerf_core.errors import InputError
+from bidnerf_core.fields import RadianceField, levels
 from bidnerf_core.geometry import Robust
 from bidnerf_core.localization import ColourSettings, DepthLossSettings
 from bidnerf_core.settings import EXPERT, Above, Count, NotNegative, OneOf, Range, Settings
@@ -59,6 +61,15 @@ class DescentSettings(Settings):
     pivot: PivotName = "camera"  # what an update rotates about: camera, world, or the middle of the scene
     # length of the sampled interval, in units of [near, far]; the paper's "wide" is 2
     wide: Annotated[float, Above(0.0, 100.0)] = 1.0
+
+    def level_of(self, field: RadianceField) -> RadianceField:
+        """Return the level of a field whose number, possibly from the end, is ``level``. Raises ``InputError`` if there is none."""
+        if self.level is None:
+            return field
+        offered = levels(field)
+        if not -len(offered) <= self.level < len(offered):
+            raise InputError(f"level is {self.level}", expected=f"0 (coarsest) to {len(offered) - 1}")
+        return offered[self.level]
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from torch import Generator, Tensor
 from torch.nn.functional import normalize
 
 from bidnerf_core.devices import move_to
+from bidnerf_core.fields import levels
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3, random_units
 from bidnerf_core.localization.accept import Support, support
@@ -112,7 +113,9 @@ def localize_by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig
         path = (problem.start or SE3.identity())[None]
         return Localization.of(why, path, torch.zeros(0, dtype=torch.float64), "auto", began, math.nan)
     for number in range(config.rounds):
-        coarse = draw_rays(problem, config.colour, None, config.fine_rays // 4, seed, 0, 2, COLOUR_SIGMA)
+        coarse = draw_rays(
+            problem, config.colour, None, config.fine_rays // 4, seed, levels(problem.field)[0], 2, COLOUR_SIGMA
+        )
         fine, fresh = (
             draw_rays(problem, config.colour, None, config.fine_rays, seed + more, sigma=COLOUR_SIGMA / 2)
             for more in (1, 2)

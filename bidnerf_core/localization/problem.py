@@ -16,7 +16,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.depth import UNKNOWN, DepthSensorModel
 from bidnerf_core.devices import move_to, working_device
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields import Observations, RadianceField, SceneBounds, device_of, levels
+from bidnerf_core.fields import Observations, RadianceField, SceneBounds, device_of
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, LengthUnit
 from bidnerf_core.localization.matching import LandmarkMatcher
@@ -128,15 +128,6 @@ class Problem:
     def device(self) -> torch.device:
         """The field's device, to which rays are moved."""
         return device_of(self.field)
-
-    def level(self, number: int | None) -> RadianceField:
-        """Return a level of the field: 0 for the coarsest, -1 for the finest, None for the field itself."""
-        if number is None:
-            return self.field
-        offered = levels(self.field)
-        if not -len(offered) <= number < len(offered):
-            raise InputError(f"level is {number}", expected=f"0 (coarsest) to {len(offered) - 1}")
-        return offered[number]
 
     def without_depth(self) -> Problem:
         """Return the problem without measured depth."""

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from bidnerf_core.devices import move_to, without_waiting
 from bidnerf_core.errors import amount
+from bidnerf_core.fields import RadianceField
 from bidnerf_core.geometry import SE3, Robust
 from bidnerf_core.localization.accept import DISPLACEMENT, Support, same_pose, support
 from bidnerf_core.localization.problem import Problem
@@ -109,20 +110,22 @@ def draw_rays(
     depth: DepthLossSettings | None,
     count: int,
     seed: int,
-    level: int | None = None,
+    field: RadianceField | None = None,
     blur: int = 1,
     sigma: float = 0.0,
 ) -> RenderedRays:
     """Draw ``count`` rays; return the term that compares their colours and, unless ``depth`` is None, their distances with renderings.
 
-    Level 0 of the field is the coarsest, None is the field itself. Observed colours are averaged over squares of ``blur`` pixels. ``sigma``
-    is the uncertainty of the map's surfaces, relative to the scene's mean side.
+    ``field`` is the level of the map's field that is rendered; None for the field itself. Observed colours are averaged over squares of
+    ``blur`` pixels. ``sigma`` is the uncertainty of the map's surfaces, relative to the scene's mean side.
     """
     bounds = problem.bounds
     if depth is not None and (depth.depth_weight == 0 or not problem.has_depth):
         depth = None
     own = None if depth is None else problem.depth_rays
-    drawn = RenderedRays.of(problem.views, problem.level(level), bounds, max(7, count), seed, blur, own)
+    drawn = RenderedRays.of(
+        problem.views, problem.field if field is None else field, bounds, max(7, count), seed, blur, own
+    )
     found = replace(drawn, loss=Robust(colour.colour_loss, colour.colour_scale), sigma=sigma * mean_side(bounds))
     if depth is None:
         return found

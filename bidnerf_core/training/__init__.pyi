@@ -8,7 +8,6 @@ from .loop import TrainingStopped as TrainingStopped
 from .loop import cosine as cosine
 from .loop import fit as fit
 from .loss import ColourTransforms as ColourTransforms
-from .loss import fit_colours as fit_colours
 from .loss import ray_termination as ray_termination
 from .loss import supervised_loss as supervised_loss
 from .photos import BLURRED as BLURRED

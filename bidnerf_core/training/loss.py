@@ -101,15 +101,3 @@ class ColourTransforms(nn.Module):
     def penalty(self) -> Float[Tensor, ""]:
         """Return the mean square of the log gains and offsets, a penalty that keeps at 0 those that the images do not constrain."""
         return self.log_gain.square().mean() + self.offset.square().mean()
-
-
-def fit_colours(rgb: Float[Tensor, "*p 3"], photo: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
-    """Apply to ``rgb`` the gain and offset per channel that best fit ``rgb`` to ``photo`` (least squares).
-
-    The gain and offset serve as the colour transform of an image outside the training set.
-    """
-    x, y = rgb.reshape(-1, 3).double(), photo.reshape(-1, 3).double()
-    around = x - x.mean(0)
-    gain = (around * y).sum(0) / around.square().sum(0).clamp(min=1e-12)
-    fitted = (rgb.double() - x.mean(0)) * gain + y.mean(0)
-    return fitted.to(rgb)

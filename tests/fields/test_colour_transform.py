@@ -1,14 +1,13 @@
-"""The colour transform of images: identity at first, learned where images differ, fitted in closed form to unseen ones."""
+"""The colour transform of images: identity at first, learned where images differ."""
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
 import tiny
 from bidnerf.scenes import demo_object
-from bidnerf_core.training import ColourTransforms, RayBank, Supervision, SupervisionConfig, fit_colours
+from bidnerf_core.training import ColourTransforms, RayBank, Supervision, SupervisionConfig
 
 
 def colours(count: int = 500) -> torch.Tensor:
@@ -56,15 +55,6 @@ def test_the_derivative_is_the_numerical_one() -> None:
     )
 
 
-def test_fitted_colours_are_those_of_numpys_least_squares() -> None:
-    rgb, noise = colours(), torch.randn(500, 3, generator=torch.Generator().manual_seed(3))
-    photo = rgb * torch.tensor([0.5, 1.4, 0.9]) + 0.1 + 0.05 * noise
-    fitted = fit_colours(rgb, photo)
-    for channel in range(3):
-        line = np.polyfit(rgb[:, channel].numpy(), photo[:, channel].numpy(), 1)
-        np.testing.assert_allclose(fitted[:, channel], np.polyval(line, rgb[:, channel].numpy()), atol=1e-5)
-
-
 @pytest.mark.parametrize("alpha", [True, False])
 def test_images_with_a_background_have_no_exposure_to_learn(alpha: bool) -> None:
     views = tiny.views()
@@ -74,8 +64,3 @@ def test_images_with_a_background_have_no_exposure_to_learn(alpha: bool) -> None
     assert (supervision.colours is None) == alpha
     assert isinstance(supervision.bank, RayBank)
     assert Supervision(views, demo_object().bounds, replace(SupervisionConfig(), exposure=False)).colours is None
-
-
-def test_an_even_image_is_fitted_by_its_mean() -> None:
-    flat = torch.full((20, 3), 0.4)
-    torch.testing.assert_close(fit_colours(flat, flat + 0.25), flat + 0.25)

@@ -319,7 +319,7 @@ def _first_order(problem: Problem, level: int, mode: Elsewhere | None) -> Tensor
 
 
 def _second_order(problem: Problem, level: int, mode: Elsewhere) -> None:
-    rays = draw_rays(problem, ColourSettings(), DepthLossSettings(), CHECKED_RAYS, 0, level)
+    rays = draw_rays(problem, ColourSettings(), DepthLossSettings(), CHECKED_RAYS, 0, levels(problem.field)[level])
     start = move_to(states_at(require(problem.start)[None]), DEVICE)
     with without_waiting():
         descend(start, [rays], 1)
