@@ -25,10 +25,10 @@ from torch.nn.functional import avg_pool2d, grid_sample
 from bidnerf import Localizer
 from bidnerf.evaluation import texture
 from bidnerf.results import success_rate
-from bidnerf.scenes import HomogeneousBall
+from bidnerf.scenes import GaussianBlobs
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields import SceneBounds, Stratified
+from bidnerf_core.fields import SceneBounds
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3, look_at
 from bidnerf_core.localization import AutoConfig
@@ -108,7 +108,7 @@ class PlanarMap:
     """A map of landmarks alone; nothing is rendered in its field."""
 
     landmarks: LandmarkMap
-    field: HomogeneousBall
+    field: GaussianBlobs
     bounds: SceneBounds
     surface: None = None
     colour_noise: float | None = 1.0
@@ -155,7 +155,7 @@ def make_map(scene: PlanarScene, generator: Generator) -> tuple[PlanarMap, Local
     landmarks = build_landmarks(training)
     if landmarks is None:
         raise InputError(f"{scene.name}: no landmarks")
-    found = PlanarMap(landmarks, HomogeneousBall(1.0, 1.0, sampler=Stratified(2)), bounds)
+    found = PlanarMap(landmarks, GaussianBlobs.random(samples=2), bounds)
     return found, Localizer(found, config=AutoConfig(fused_rays=0))
 
 

@@ -9,7 +9,7 @@ from .closed_form_data import is_closed_form as is_closed_form
 from .demo import demo_object as demo_object
 from .demo import demo_room as demo_room
 from .fields import GaussianBlobs as GaussianBlobs
-from .fields import HomogeneousBall as HomogeneousBall
+from .fields import MovedField as MovedField
 from .primitives import Box as Box
 from .primitives import Primitive as Primitive
 from .primitives import Shape as Shape

@@ -110,7 +110,7 @@ def closed_form_map(name: str) -> Map:
     """Return the map ``demo:NAME``. Raises ``InputError`` for a name whose field is not known in closed form."""
     _check(name, ("blobs",), "map")
     info = MapInfo("closed-form", {}, BLOBS, 0, True, "demo:blobs", weights="exact", unit="metres")
-    return Map(info, _blob_field())
+    return Map(info, BLOB_FIELD)
 
 
 def _check(name: str, known: Sequence[str], what: str) -> None:
@@ -122,14 +122,11 @@ def _check(name: str, known: Sequence[str], what: str) -> None:
 
 
 BLOBS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 12.0, (1.0, 1.0, 1.0))
-
-
-def _blob_field() -> GaussianBlobs:
-    return GaussianBlobs.random(count=7, seed=3, density=400.0)
+BLOB_FIELD = GaussianBlobs.random(count=7, seed=3, density=400.0)
 
 
 def _render_blobs(T: SE3, name: str) -> Frame:
     half = Intrinsics(87.5, 87.5, 32.0, 32.0, 64, 64)
-    image = render_image(_blob_field(), half, T, BLOBS)
+    image = render_image(BLOB_FIELD, half, T, BLOBS)
     depth = torch.where(image.opacity > 0.99, image.depth, 0)  # only nearly opaque pixels have depth
     return Frame(name, image.rgb, half, depth, image.opacity)

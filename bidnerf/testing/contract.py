@@ -20,6 +20,17 @@ from bidnerf_core.io import from_plain, to_plain
 from bidnerf_core.registry import interface_defects
 
 
+def _on_levels(check: Callable[[RadianceField], None]) -> Callable[[BackendContract], None]:
+    """Return a test that runs ``check`` on all levels of an untrained and of a trained field."""
+
+    def test(contract: BackendContract) -> None:
+        for field in contract._fields():
+            for level in levels(field):
+                check(level)
+
+    return test
+
+
 class BackendContract:
     """Tests of a backend; to use them, derive a class whose name begins with ``Test`` and set ``backend`` or ``name``.
 
@@ -88,20 +99,19 @@ class BackendContract:
 
     # The field's values, at each of its levels.
 
-    def test_query_takes_any_shape(self) -> None:
-        self._each(field_checks.check_shapes)
+    test_query_takes_any_shape = _on_levels(field_checks.check_shapes)
 
-    def test_query_is_finite_and_in_range(self) -> None:
-        self._each(field_checks.check_ranges)
+    test_query_is_finite_and_in_range = _on_levels(field_checks.check_ranges)
 
-    def test_query_is_differentiable_by_position(self) -> None:
-        self._each(lambda field: field_checks.check_position_derivatives(*precise(field)))
+    test_query_is_differentiable_by_position = _on_levels(
+        lambda field: field_checks.check_position_derivatives(*precise(field))
+    )
 
-    def test_query_is_differentiable_by_direction(self) -> None:
-        self._each(lambda field: field_checks.check_direction_derivatives(*precise(field)))
+    test_query_is_differentiable_by_direction = _on_levels(
+        lambda field: field_checks.check_direction_derivatives(*precise(field))
+    )
 
-    def test_jacobian_is_the_derivative_of_query(self) -> None:
-        self._each(lambda field: field_checks.check_jacobian(*precise(field)))
+    test_jacobian_is_the_derivative_of_query = _on_levels(lambda field: field_checks.check_jacobian(*precise(field)))
 
     def test_query_follows_the_dtype(self) -> None:
         for field in self._fields():
@@ -123,25 +133,19 @@ class BackendContract:
         same = field_checks.close(found, field_checks.render_channels(field, rays, "rays"), 2e-2)
         require(type(field).__name__, (same, "renders otherwise on CUDA than on the CPU"))
 
-    def test_query_serves_several_threads(self) -> None:
-        self._each(field_checks.check_threads)
+    test_query_serves_several_threads = _on_levels(field_checks.check_threads)
 
     # Sampling and rendering.
 
-    def test_samples_are_sorted_disjoint_and_on_the_ray(self) -> None:
-        self._each(field_checks.check_intervals)
+    test_samples_are_sorted_disjoint_and_on_the_ray = _on_levels(field_checks.check_intervals)
 
-    def test_samples_are_repeatable(self) -> None:
-        self._each(field_checks.check_repeatable)
+    test_samples_are_repeatable = _on_levels(field_checks.check_repeatable)
 
-    def test_rays_do_not_depend_on_each_other(self) -> None:
-        self._each(field_checks.check_rays_alone)
+    test_rays_do_not_depend_on_each_other = _on_levels(field_checks.check_rays_alone)
 
-    def test_rays_that_miss_see_the_background(self) -> None:
-        self._each(field_checks.check_background)
+    test_rays_that_miss_see_the_background = _on_levels(field_checks.check_background)
 
-    def test_hits_agree_with_the_density(self) -> None:
-        self._each(field_checks.check_hits)
+    test_hits_agree_with_the_density = _on_levels(field_checks.check_hits)
 
     def test_levels_are_fields_coarsest_first(self) -> None:
         for field in self._fields():
@@ -232,12 +236,6 @@ class BackendContract:
     def _fields(self) -> Iterator[Any]:
         yield frozen(self._build())
         yield self._trained()
-
-    def _each(self, check: Callable[[RadianceField], None]) -> None:
-        """Run ``check`` on all levels of an untrained and of a trained field."""
-        for field in self._fields():
-            for level in levels(field):
-                check(level)
 
 
 def frozen(field: Any) -> Any:

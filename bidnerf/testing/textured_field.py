@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf.scenes import orbit
+from bidnerf.scenes import MovedField, orbit
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import FieldValues, RadianceField, RaySampler, SceneBounds, Stratified, render_image
 from bidnerf_core.frames import Frame, View
@@ -105,22 +105,6 @@ def textured_map(surface: bool = False) -> MapWithLandmarks:
         baked = bake(ground(), BOUNDS, [], training_views(), BakeConfig(cells=200_000))
         return replace(textured_map(), surface=baked)
     return MapWithLandmarks(ground(), BOUNDS, build_landmarks(training_views()))
-
-
-@dataclass(frozen=True, eq=False)
-class MovedField:
-    """The textured ground expressed in another world frame."""
-
-    field: TexturedGround
-    T_new_old: SE3
-
-    @property
-    def sampler(self) -> RaySampler:
-        return self.field.sampler
-
-    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
-        back = self.T_new_old.inverse().to(dtype=positions.dtype)
-        return self.field.query(back.apply(positions), back.rotate(directions))
 
 
 T_MOVED_WORLD = SE3(

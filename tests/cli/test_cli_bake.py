@@ -16,9 +16,9 @@ import pytest
 import torch
 
 import tiny
+from balls import HomogeneousBall
 from bidnerf import train
 from bidnerf.cli import main
-from bidnerf.scenes import HomogeneousBall
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import track_landmarks
 from bidnerf_core.datasets import DatasetOptions, open_dataset

@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from bidnerf.scenes import GaussianBlobs, HomogeneousBall
+from balls import HomogeneousBall
+from bidnerf.scenes import GaussianBlobs
 from bidnerf.testing import (
     check_background,
     check_intervals,

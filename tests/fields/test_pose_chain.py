@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from bidnerf.results import pose_error
-from bidnerf.scenes import GaussianBlobs, orbit
+from bidnerf.scenes import GaussianBlobs, MovedField, orbit
 from bidnerf_bid import Objective
 from bidnerf_bid.residuals import colour_term, depth_term
 from bidnerf_core.fields import Observations, SceneBounds, render, widen
@@ -64,7 +64,7 @@ def test_a_moved_world_gives_a_moved_answer() -> None:
     frame = photograph(truth, field=field)
     few = {"rays": 256, "max_steps": 25, "level": None}
     here = localize(single(field, roomy, frame, start), "bid", few, seed=0)
-    there = localize(single(field.moved(motion), roomy, frame, motion @ start), "bid", few, seed=0)
+    there = localize(single(MovedField(field, motion), roomy, frame, motion @ start), "bid", few, seed=0)
     expected = motion @ here.T_world_camera
     torch.testing.assert_close(there.T_world_camera.matrix(), expected.matrix(), atol=2e-4, rtol=0)
     assert float(pose_error(here.T_world_camera, start).translation) > 0.05

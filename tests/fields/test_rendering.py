@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf.scenes import HomogeneousBall, closed_form_data, closed_form_map
+from balls import HomogeneousBall
+from bidnerf.scenes import closed_form_data, closed_form_map
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import (
     FieldValues,

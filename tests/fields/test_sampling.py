@@ -9,7 +9,8 @@ import pytest
 import torch
 from torch import Generator
 
-from bidnerf.scenes import GaussianBlobs, HomogeneousBall
+from balls import HomogeneousBall
+from bidnerf.scenes import GaussianBlobs
 from bidnerf.testing import check_background, check_intervals, check_rays_alone, check_repeatable
 from bidnerf_core.fields import (
     Concentrated,

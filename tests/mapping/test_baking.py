@@ -15,7 +15,8 @@ import torch
 from torch import Generator, Tensor
 
 import baked
-from bidnerf.scenes import Box, HomogeneousBall, Sphere, blotches, orbit
+from balls import HomogeneousBall
+from bidnerf.scenes import Box, Sphere, blotches, orbit
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.fields import FieldValues, SceneBounds, VoxelGrid
 from bidnerf_core.frames import View

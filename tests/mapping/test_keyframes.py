@@ -9,10 +9,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from balls import HomogeneousBall
 from bidnerf import SE3, View
 
 # Inside: the limits on the number and size of keyframes, which a map does not state
-from bidnerf.scenes import HomogeneousBall, orbit
+from bidnerf.scenes import orbit
 from bidnerf.testing import BOUNDS, GROUND_CAMERA, ground, training_views, unseen
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import SceneBounds, Stratified

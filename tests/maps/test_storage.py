@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 import baked
 import tiny
-from bidnerf.scenes import HomogeneousBall
+from balls import HomogeneousBall
 from bidnerf_core.backend import load_backend
 from bidnerf_core.captures import CaptureReport, CoverageRecord, PoseRefinement, StoredCamera, stored_cameras
 from bidnerf_core.errors import InputError, InputWarning

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 import baked
 import module_fields
 import tiny
+from balls import HomogeneousBall
 from bidnerf import Localizer, Map
-from bidnerf.scenes import HomogeneousBall
 from bidnerf.testing import textured_map
 from bidnerf_core.backend import load_backend
 from bidnerf_core.devices import Resident, may_wait, move_to, run_on
