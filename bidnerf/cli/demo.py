@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 from bidnerf.cli.options import Overwrite, Seed, installed
 from bidnerf.cli.output import console, print_table, say, show
@@ -15,30 +15,18 @@ from bidnerf_core.registry import USUAL_BACKEND
 from bidnerf_core.settings import WholeNumbers
 
 if TYPE_CHECKING:
-    from bidnerf.results import PoseError
     from bidnerf_core.frames import View
     from bidnerf_core.geometry import SE3
     from bidnerf_core.localization import Localization
     from bidnerf_core.maps import Map
 
-TRAINING_VIEWS, ANIMATED = 60, 14
-"""Number of training images, and of frames of the animation."""
+TRAINING_VIEWS = 60
+"""Number of training images."""
 DESCENT = {"rays": 768, "max_steps": 150, "decay_steps": 60}  # faster than the defaults, for small images
 
 
-class DemoFrame(NamedTuple):
-    """An unseen frame, a start far from its true pose, and the answers of two methods."""
-
-    view: View
-    start: SE3
-    auto: Localization  # without the start
-    bid: Localization  # from the start
-
-    def errors(self, poses: SE3) -> PoseError:
-        """Return the errors of poses relative to the true pose of the frame."""
-        from bidnerf.results import pose_error
-
-        return pose_error(poses, self.view.T_ref_camera, self.auto.unit)
+DemoFrame: TypeAlias = "tuple[View, SE3, Localization, Localization]"
+"""An unseen frame, a start far from its true pose, and the answers of method auto without the start and of bid from the start."""
 
 
 def run_demo(
@@ -54,6 +42,7 @@ def run_demo(
     The results are drawn. The frames are RGB-D images from poses that training never saw. Each is localized twice: by method auto without a start, and
     by method bid from a start far from its pose.
     """
+    from bidnerf.results import pose_error
     from bidnerf.scenes import demo_object, orbit, views
     from bidnerf_core.backend import load_backend, quick_config
     from bidnerf_core.camera import Intrinsics
@@ -86,18 +75,17 @@ def run_demo(
         )
         say(f"localizing {frames} unseen frames by auto without a start, and by bid from a start nearby")
         auto, bid = Localizer(stored), Localizer(stored, "bid", settings_of("bid", DESCENT))
-        trials, rows = [], []
+        trials, rows = list[DemoFrame](), []
         for number, view in enumerate(unseen):
             # The error of the start is in scene units (the object fills a 2x2x2 cube) and degrees.
             start = perturb(view.T_ref_camera, 0.55, 13.0, seed=seed + number)
             with console.status(f"localizing frame {number + 1}"):
-                trial = DemoFrame(view, start, auto(view.frame, seed=seed), bid(view.frame, start, seed=seed))
-            trials.append(trial)
-            begin = trial.errors(start)
-            unit = symbol(begin.unit)
+                answers = auto(view.frame, seed=seed), bid(view.frame, start, seed=seed)
+            trials.append((view, start, *answers))
+            begin, unit = pose_error(start, view.T_ref_camera), symbol(stored.unit)
             starts = ["none", ""], [f"{begin.translation:.3f} {unit}", f"{begin.rotation_deg:.1f} deg"]
-            for localization, cells in zip((trial.auto, trial.bid), starts, strict=True):
-                end = trial.errors(localization.T_world_camera)
+            for localization, cells in zip(answers, starts, strict=True):
+                end = pose_error(localization.T_world_camera, view.T_ref_camera)
                 rows.append(
                     [
                         view.frame.name,
@@ -118,7 +106,7 @@ def run_demo(
 def _draw(stored: Map, trials: list[DemoFrame], out: Path) -> None:
     import numpy as np
 
-    from bidnerf.results import Painter, save_gif
+    from bidnerf.results import Painter
     from bidnerf_core.io import png_bytes, write_file
 
     for view, start, auto, bid in trials:
@@ -133,13 +121,8 @@ def _draw(stored: Map, trials: list[DemoFrame], out: Path) -> None:
             ),
         )
         write_file(out / f"overlay-{view.frame.name}.png", png_bytes(np.concatenate(rows, axis=0)))
-    first = trials[0]
-    painter, path, steps = Painter(stored, first.view.frame), first.bid.poses, first.bid.steps
-    # Denser at the beginning, where most of the motion happens.
-    moments = sorted({round(steps * (i / (ANIMATED - 1)) ** 2) for i in range(ANIMATED)})
-    with console.status("drawing the animation"):
-        save_gif(out / "localization.gif", [painter.blend(path[i]) for i in moments])
-    show(f"look at {out / 'overlay-*.png'}, {out / 'localization.gif'}")
-    photo = out / "data" / "images" / "test" / f"{first.view.frame.name}.png"
-    show(f"ask for a photo: bidnerf localize {out / 'map'} {photo} --focal {first.view.frame.intrinsics.fx:g}")
+    show(f"look at {out / 'overlay-*.png'}")
+    frame = trials[0][0].frame
+    photo = out / "data" / "images" / "test" / f"{frame.name}.png"
+    show(f"ask for a photo: bidnerf localize {out / 'map'} {photo} --focal {frame.intrinsics.fx:g}")
     show(f"see why a pose was found: bidnerf view {out / 'map'} {out / 'data'}  (pip install 'bidnerf[viewer]')")

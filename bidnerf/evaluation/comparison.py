@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
@@ -11,10 +10,9 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import nn
 
-from bidnerf.evaluation.plan import Plan, Trial, list_trials
+from bidnerf.evaluation.plan import Plan, list_trials
 from bidnerf.evaluation.results import align_cells, as_line
 from bidnerf.evaluation.run import (
     InThisProcess,
@@ -26,7 +24,6 @@ from bidnerf.evaluation.run import (
 from bidnerf.evaluation.summary import ABSOLUTE, RELATIVE, Summary, summarize
 from bidnerf.evaluation.trial import (
     MapSource,
-    Scene,
     TrialResult,
     open_data,
     open_scene,
@@ -35,11 +32,8 @@ from bidnerf.evaluation.trial import (
 )
 from bidnerf.scenes import is_closed_form
 from bidnerf_core.errors import InputError, amount, printable
-from bidnerf_core.fields import device_of, levels
-from bidnerf_core.frames import View, draw, uniform
-from bidnerf_core.geometry import SE3, symbol
+from bidnerf_core.geometry import symbol
 from bidnerf_core.io import to_plain, write_file
-from bidnerf_core.localization import origin_of
 from bidnerf_core.maps import DESCRIPTION, Map, ViewSource, load_info, name_maps
 from bidnerf_core.progress import (
     Cancel,
@@ -58,21 +52,13 @@ class MapRow(Summary):
     map: str  # the shortest name that is unique among the maps
     backend: str
     weights: str  # identifies the training run, see ``Map.training``
-    samples_per_ray: float  # mean
     map_bytes: int  # size of the map's description and weights
 
     @classmethod
-    def of(cls, label: str, size: int, results: Sequence[TrialResult], samples: Sequence[float]) -> MapRow:
-        """Return the statistics of trials on one map of ``size`` bytes; ``samples`` holds the samples per ray of each."""
-        first = results[0]
-        return cls(
-            map=label,
-            backend=first.backend,
-            weights=first.weights,
-            samples_per_ray=statistics.fmean(samples),
-            map_bytes=size,
-            **vars(summarize(results)),
-        )
+    def of(cls, label: str, size: int, results: Sequence[TrialResult]) -> MapRow:
+        """Return the statistics of trials on one map of ``size`` bytes."""
+        first, statistics = results[0], vars(summarize(results))
+        return cls(map=label, backend=first.backend, weights=first.weights, map_bytes=size, **statistics)
 
     def cells(self) -> dict[str, str]:
         """Return the statistics as text, by name."""
@@ -89,14 +75,13 @@ class MapRow(Summary):
             **rates,
             "median error": f"{_number(self.translation, 4)} {symbol(self.unit)}",
             "median error, deg": _number(self.rotation_deg, 2),
-            "CPU s a trial": _number(self.cpu_seconds, 2),
+            "CPU s a trial": f"{self.cpu_seconds:.2f}",
             "s a trial": f"{self.seconds:.2f}",
             "steps": f"{self.steps:g}",
             "steps to success": _number(usual.steps, 0),
             "ms a step": f"{self.ms_per_step:.1f}",
             "ms to success": _number(usual.milliseconds, 0),
             "peak memory, MiB": f"{self.peak_memory_bytes / 2**20:.0f}",
-            "samples a ray": f"{self.samples_per_ray:.1f}",
             "map, MiB": f"{self.map_bytes / 2**20:.1f}",
         }
 
@@ -189,14 +174,14 @@ def compare(
             for name in sources
         }
         turns = list(product(starts, sources))
-        pairs: dict[str, list[tuple[TrialResult, float]]] = {name: [] for name in sources}
+        results: dict[str, list[TrialResult]] = {name: [] for name in sources}
         for number, (start, name) in enumerate(turns, start=1):
             check_cancelled("comparison")
             device = device_name(sources[name], plan.device)
             trial = replace(start, map=name if name in here else str(sources[name]), device=device)
             try:
-                running = executors[name].submit(run_and_sample, trial, here.get(name), registered_for(trial))
-                pairs[name].append(running.result())
+                running = executors[name].submit(run_trial, trial, here.get(name), registered_for(trial))
+                results[name].append(running.result())
             except BrokenProcessPool as error:
                 raise InputError(
                     f"the process that localized frame {trial.frame} ended",
@@ -205,11 +190,7 @@ def compare(
                     " 'if __name__ == \"__main__\"'?",
                 ) from error
             report_progress(Progress("comparison", number, len(turns), "trials", f"{trial.frame} in {name}"))
-    results = {name: tuple(result for result, _ in own) for name, own in pairs.items()}
-    rows = tuple(
-        MapRow.of(name, map_bytes(source), results[name], [samples for _, samples in pairs[name]])
-        for name, source in sources.items()
-    )
+    rows = tuple(MapRow.of(name, map_bytes(source), results[name]) for name, source in sources.items())
     first = next(iter(results.values()))[0]
     return Comparison(
         first.trial.data,
@@ -221,29 +202,8 @@ def compare(
         first.seed,
         len(starts),
         rows,
-        tuple(results.values()),
+        tuple(map(tuple, results.values())),
     )
-
-
-def run_and_sample(
-    trial: Trial, scene: Scene | None = None, registered: Sequence[tuple[str, str]] = ()
-) -> tuple[TrialResult, float]:
-    """Run a trial as ``run_trial`` does, and also return the samples per ray in its last frame at the true pose.
-
-    The samples per ray are the mean number of valid samples on uniformly drawn rays, at the level of detail
-    that the method uses or, if it uses none, for the field itself.
-    """
-    result = run_trial(trial, scene, registered)
-    stored, dataset = scene or open_scene(trial.map, trial.data, trial)
-    (view,) = dataset.views(trial.images.split, trial.frames[-1:])
-    number = result.settings.get("level")
-    level = stored.field if number is None else levels(stored.field)[number]
-    own, rays = (View(view.frame, SE3.identity()),), 2048  # on which samples are counted
-    device = device_of(stored.field)
-    pixels = draw(own, rays, uniform, torch.Generator().manual_seed(trial.seed), device=device)
-    with torch.no_grad():
-        samples = level.sampler(pixels.rays(view.T_ref_camera.translated(-origin_of(stored)), stored.bounds))
-    return result, float(samples.valid.sum()) / rays
 
 
 def map_bytes(source: MapSource) -> int:

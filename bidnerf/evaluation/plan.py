@@ -293,18 +293,17 @@ def list_trials(plan: Plan, map: str, data: str, dataset: Capture) -> list[Trial
     split = plan.images.split
     protocol, names = find_protocol(plan.protocol), dataset.frame_names(split)
     check_depth(plan.faults, plan.depth)
-    for name in plan.frames or ():
-        if name not in names:
-            others = {split: dataset.frame_names(split) for split in dataset.splits}
-            elsewhere = describe_other_split(name, others) or f"no frame {name!r}"
-            raise InputError(f"split {split!r}: {elsewhere}", where=data)
-    chosen = names if plan.frames is None else [name for name in names if name in plan.frames]
-    hidden = {*dataset.hidden_frames(split)}.intersection(chosen)
+    for name in (name for name in plan.frames or () if name not in names):
+        others = {split: dataset.frame_names(split) for split in dataset.splits}
+        elsewhere = describe_other_split(name, others) or f"no frame {name!r}"
+        raise InputError(f"split {split!r}: {elsewhere}", where=data)
+    chosen = [name for name in names if plan.frames is None or name in plan.frames]
+    hidden = [name for name in dataset.hidden_frames(split) if name in chosen]
     visible = [name for name in chosen if name not in hidden]
     if hidden:
-        where, shown = plan.images.masks or data, [name for name in chosen if name in hidden]
-        text = f"masks hide {amount(len(shown), 'whole frame')} of {len(chosen)}, not tried: {', '.join(shown[:4])}"
-        text += ", ..." if len(shown) > 4 else ""
+        where, more = plan.images.masks or data, ", ..." if len(hidden) > 4 else ""
+        listed = f"{', '.join(hidden[:4])}{more}"
+        text = f"masks hide {amount(len(hidden), 'whole frame')} of {len(chosen)}, not tried: {listed}"
         if not visible:
             raise InputError(f"{text}; {INVERTED}", where=where)
         warnings.warn(f"{where}: {text}", InputWarning, stacklevel=2)

@@ -253,7 +253,7 @@ def comparison_figure(folder: Path, comparison: Comparison) -> Path:
         axes.margins(x=0.25)
 
     costs = {
-        "CPU s a trial": [row.cpu_seconds or 0.0 for row in comparison.rows],
+        "CPU s a trial": [row.cpu_seconds for row in comparison.rows],
         "peak memory, MiB": [row.peak_memory_bytes / 2**20 for row in comparison.rows],
         "map, MiB": [row.map_bytes / 2**20 for row in comparison.rows],
     }

@@ -29,7 +29,7 @@ import torch
 import bidnerf_core
 from bidnerf.evaluation.plan import Trial
 from bidnerf.evaluation.summary import ResultGroup, group_results
-from bidnerf.evaluation.trial import TrialResult, read_result
+from bidnerf.evaluation.trial import TrialResult
 from bidnerf.results import CRITERIA
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.geometry import symbol
@@ -144,7 +144,7 @@ def _parse(path: Path, content: bytes) -> tuple[list[TrialResult], int]:
             raise
         if plain is not None:
             try:
-                results.append(read_result(plain, where))
+                results.append(from_plain(TrialResult, plain, where))
             except InputError as error:
                 raise with_writer(error, *_writers(path)) from error
         length += len(line) + (number < len(lines))

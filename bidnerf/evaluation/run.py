@@ -131,12 +131,6 @@ def run_trials(
     todo = missing_trials(trials, file, scene)
     if len(todo) < len(trials):
         log.info("%s: %d of %d trials are already there", file.path, len(trials) - len(todo), len(trials))
-    if unchecked := sum(trial in file and file[trial].inputs is None for trial in trials):
-        log.info(
-            "%s: %d results of an earlier version do not record their images and are kept unchecked",
-            file.path,
-            unchecked,
-        )
     if not todo:
         return
     where = "" if file.path is None else f" in {file.path}"
@@ -211,8 +205,6 @@ def missing_trials(trials: Sequence[Trial], file: ResultsFile, scene: Scene | No
             before = result.settings.get(name, usual.get(name))
             if before != value:
                 raise InputError(f"was made with {name} {before}, expected {value}; {advice}", where=file.path)
-        if result.inputs is None:  # not recorded by an earlier version
-            continue
         # The images depend on the seed only if they have faults.
         seed = None if trial.fault == NO_FAULT else trial.seed
         read = trial.frames, trial.depth, trial.fault, seed

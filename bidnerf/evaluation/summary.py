@@ -177,7 +177,7 @@ class Summary:
     rotation_deg: float | None  # median of the final errors
     steps: float  # median
     seconds: float  # median
-    cpu_seconds: float | None  # median; None in results of earlier versions
+    cpu_seconds: float  # median
     ms_per_step: float  # median
     peak_memory_bytes: int  # largest
     converged: int
@@ -198,7 +198,7 @@ def summarize(results: Sequence[TrialResult]) -> Summary:
         rotation_deg=median(e.rotation_deg if e else None for e in errors),
         steps=statistics.median(r.steps for r in results),
         seconds=statistics.median(r.seconds for r in results),
-        cpu_seconds=median(r.cpu_seconds for r in results),
+        cpu_seconds=statistics.median(r.cpu_seconds for r in results),
         ms_per_step=statistics.median(1000 * r.seconds / max(1, r.steps) for r in results),
         peak_memory_bytes=max(r.peak_memory_bytes for r in results),
         converged=sum(accepted for accepted, _ in pairs),

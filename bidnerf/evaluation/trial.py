@@ -105,26 +105,17 @@ class TrialResult:
     settings: dict[str, Any]  # all settings of the method
     weights: str  # identifies the map's training run, see ``Map.training``
     trial: Trial  # with folders' names instead of paths
-    outcome: str = ""  # the method's outcome; empty in results of earlier versions
+    outcome: str  # the method's
+    inputs: InputDigests
+    cpu_seconds: float  # of the process; unlike ``seconds``, other processes do not lengthen it
     focal_factor: float = 1.0  # ratio of the true to the given focal length, if it was estimated as well
     intrinsics: Intrinsics | None = None  # those used for the pose, if they differ from the given ones
     confidence: float | None = None  # probability that the pose is right; None if unknown
     unit: LengthUnit = "units"  # of all lengths: that of the map
-    inputs: InputDigests | None = None  # None in results of earlier versions
-    cpu_seconds: float | None = None  # of the process; unlike ``seconds``, other processes do not lengthen it
 
     def plain(self) -> dict[str, Any]:
-        """Return the result as an object of strict JSON, in which the trial has flat names; ``read_result`` reads it."""
+        """Return the result as an object of strict JSON, in which the trial has flat names."""
         return to_plain(self) | {"trial": to_flat(self.trial)}
-
-
-def read_result(plain: Any, where: str) -> TrialResult:
-    """Return the result stored as ``plain``. Raises ``InputError``, whose message begins with ``where``, for anything else."""
-    for part, name in (("trial", "depth_points"), ("inputs", "points")):  # of earlier versions, usually null
-        values = plain.get(part) if isinstance(plain, dict) else None
-        if isinstance(values, dict) and values.get(name, "") is None:
-            plain = plain | {part: {key: value for key, value in values.items() if key != name}}
-    return from_plain(TrialResult, plain, where)
 
 
 def run_trial(trial: Trial, scene: Scene | None = None, registered: Sequence[tuple[str, str]] = ()) -> TrialResult:
@@ -164,7 +155,7 @@ def run_trial(trial: Trial, scene: Scene | None = None, registered: Sequence[tup
         "inputs": to_plain(inputs),
         "cpu_seconds": cpu_seconds,
     }
-    return read_result(plain_localization(answer, stored.info.backend, error) | more, "result")
+    return from_plain(TrialResult, plain_localization(answer, stored.info.backend, error) | more, "result")
 
 
 def registered_for(trial: Trial) -> list[tuple[str, str]]:

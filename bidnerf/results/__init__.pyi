@@ -26,7 +26,6 @@ from .matches import landmark_matches as landmark_matches
 from .overlays import Painter as Painter
 from .overlays import as_picture as as_picture
 from .overlays import overlay as overlay
-from .overlays import save_gif as save_gif
 from .overlays import tile as tile
 from .plots import COLOURS as COLOURS
 from .plots import CRITERION_NAMES as CRITERION_NAMES
@@ -40,7 +39,6 @@ from .plots import write_figure as write_figure
 from .pose_files import OPENCV_AXES as OPENCV_AXES
 from .pose_files import LandmarkMatches as LandmarkMatches
 from .pose_files import PosedImage as PosedImage
-from .pose_files import Refusal as Refusal
 from .pose_files import pose_entries as pose_entries
 from .pose_files import pose_format as pose_format
 from .pose_files import pose_of as pose_of

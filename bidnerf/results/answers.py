@@ -24,7 +24,7 @@ from bidnerf.results.errors import (
     within,
 )
 from bidnerf.results.plots import draw_path
-from bidnerf.results.pose_files import LandmarkMatches, PosedImage, Refusal, pose_format, refused_file, write_poses
+from bidnerf.results.pose_files import LandmarkMatches, PosedImage, pose_format, refused_file, write_poses
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import UpDirection, given_cameras
 from bidnerf_core.errors import InputError, amount
@@ -68,9 +68,12 @@ class Answer:
 
         Only the final pose is stored: intermediate ones take up a lot of memory in long sequences.
         """
-        intrinsics = localization.frame_as_taken(frame).intrinsics
         return Answer(
-            frame.name, number, intrinsics, replace(localization, poses=localization.poses[-1:], picture=None), **about
+            frame.name,
+            number,
+            localization.frame_as_taken(frame).intrinsics,
+            replace(localization, poses=localization.poses[-1:], picture=None),
+            **about,
         )
 
     @property
@@ -115,9 +118,6 @@ class Answers:
         self.scene, self.is_sequence, self.interval = scene, is_sequence, interval
         self.given: list[Answer | Failure] = []
         self.unread = 0  # frames of a sequence whose files could not be read
-        self._next = 0  # number of the next answer
-        self._lost_at: int | None = None
-        self._camera_sources: set[str] = set()
 
     @property
     def unit(self) -> LengthUnit:
@@ -146,36 +146,6 @@ class Answers:
     def append(self, answer: Answer | Failure) -> None:
         """Append an answer or a failure."""
         self.given.append(answer)
-        self._next = 1 + (answer.number if isinstance(answer, Answer) else self._next)
-
-    def add(
-        self,
-        frame: Frame,
-        localization: Localization,
-        time: float | None = None,
-        truth: SE3 | None = None,
-        number: int | None = None,
-        file: Path | None = None,
-    ) -> Answer:
-        """Add the answer for the next frame of a sequence, and return it.
-
-        ``number`` is the frame's index in its sequence, by default one more than the last. ``time`` is in
-        seconds, ``truth`` is the true T_world_camera, and ``file`` the image file.
-        """
-        number = self._next if number is None else number
-        if frame.camera_source and frame.camera_source not in self._camera_sources:
-            self._camera_sources.add(frame.camera_source)
-            log.info("%s: %s", frame.name, frame.camera_source)
-        answer = Answer.of(frame, number, localization, truth=truth, time=time, file=file)
-        self.append(answer)
-        if not localization.converged and self._lost_at is None:
-            self._lost_at = len(self)
-            log.info("frame %d (%s): %s: %s", number + 1, frame.name, localization.outcome, localization.reason)
-        elif localization.converged and self._lost_at is not None:
-            missed = amount(len(self) - self._lost_at, "frame")
-            log.info("frame %d (%s): tracking again after %s", number + 1, frame.name, missed)
-            self._lost_at = None
-        return answer
 
     def plain(self, answer: Answer | Failure) -> dict[str, Any]:
         """Return an answer as the JSON object printed by ``bidnerf localize --json``.
@@ -184,13 +154,11 @@ class Answers:
         runner-up. Numbers and matrices that are not finite become None. For an image that could not be read,
         the outcome is "bad input".
         """
-        backend = getattr(getattr(self.scene, "info", None), "backend", "")
-        placement, values = None, dict[str, Any](frame=answer.name)
+        placement, values = getattr(answer, "placement", None), dict[str, Any](frame=answer.name)
+        backend = getattr(placement or getattr(self.scene, "info", None), "backend", "")
         if self.is_sequence:
-            values |= {"time": answer.time if isinstance(answer, Answer) else None}
+            values |= {"time": getattr(answer, "time", None)}
         if isinstance(answer, Answer):
-            placement = answer.placement
-            backend = backend if placement is None else placement.backend
             values |= plain_localization(answer.localization, backend, answer.error)
         else:
             values |= {
@@ -260,16 +228,11 @@ class Answers:
             rows = ",\n".join(json.dumps(self.plain(answer), allow_nan=False) for answer in self.given)
             write_file(path, f"[\n{rows}\n]\n".encode())
             return
-        others = [
-            Refusal(each.name, BAD_INPUT, each.reason)
-            if isinstance(each, Failure)
-            else Refusal(each.name, str(each.localization.outcome), each.localization.reason)
-            for each in self.given
-            if not (isinstance(each, Answer) and each.accepted)
-        ]
-        write_poses(path, [self._posed(answer) for answer in self.accepted], others)
-        if others:
-            poses, images = amount(len(self.accepted), "pose"), amount(len(others), "image")
+        accepted, others = self.accepted, [each for each in self.given if not getattr(each, "accepted", False)]
+        refused = ["{frame}: {outcome} ({reason})".format_map(self.plain(each)) for each in others]
+        write_poses(path, [self._posed(answer) for answer in accepted], refused)
+        if refused:
+            poses, images = amount(len(accepted), "pose"), amount(len(refused), "image")
             log.info("%s: %s; %s without an accepted pose: see %s", path, poses, images, refused_file(path).name)
 
     def _posed(self, answer: Answer) -> PosedImage:
@@ -335,8 +298,7 @@ class Answers:
         known = [(answer.localization.T_world_camera, answer.truth) for answer in self.accepted if answer.truth]
         if not known:
             return None
-        estimated, true = (SE3.stack(list(poses)) for poses in zip(*known, strict=True))
-        return estimated, true
+        return SE3.stack([estimated for estimated, _ in known]), SE3.stack([true for _, true in known])
 
     def plot(self, file: str | Path, surface: SurfaceMap | None = None, up: UpDirection | None = None) -> None:
         """Plot the trajectory over the surface of its map, as PNG or SVG by file extension.
@@ -384,8 +346,7 @@ class Answers:
             if answer.truth is not None and answer.localization.covariance is not None
         ]
         if inside:
-            share = sum(inside) / len(inside)
-            rows.append(("inside 95 % bound", f"{share:.1%} (by the poses' covariances)"))
+            rows.append(("inside 95 % bound", f"{sum(inside) / len(inside):.1%} (by the poses' covariances)"))
         # Frames are training images of the map if their names and true poses are the same, up to rounding in files.
         info = getattr(self.scene, "info", None)
         cameras = () if info is None else given_cameras(info.cameras)
@@ -397,8 +358,7 @@ class Answers:
             for answer in self.answers
         )
         if seen:
-            no_test = "errors on training frames of the map are no test"
-            rows.append(("trained on", f"{amount(seen, 'frame')}; {no_test}"))
+            rows.append(("trained on", f"{amount(seen, 'frame')}; errors on training frames of the map are no test"))
         return [(name, text) for name, text in rows if text]
 
 

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf.results.pose_files import PosedImage, Refusal, frame_of, pose_format
+from bidnerf.results.pose_files import PosedImage, frame_of, pose_format
 from bidnerf_core.camera import Intrinsics, colmap_model
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.io import write_file
@@ -41,7 +41,7 @@ def check_pose_file(path: Path) -> None:
             raise InputError("would be replaced, since a COLMAP model has one;", where=beside, expected=expected)
 
 
-def write_colmap_poses(path: Path, images: Sequence[PosedImage], refused: Sequence[Refusal] = ()) -> None:
+def write_colmap_poses(path: Path, images: Sequence[PosedImage], refused: Sequence[str] = ()) -> None:
     """A COLMAP model: images.txt, and cameras.txt and points3D.txt beside it.
 
     Image names are file paths relative to the folder that contains all of the images. Keypoints that agree with landmarks of the map
@@ -90,7 +90,7 @@ def write_colmap_model(
     path: Path,
     images: Sequence[PosedImage],
     points: tuple[Int[Tensor, "n"], Float[Tensor, "n 3"], Int[Tensor, "n 3"]] | None = None,
-    refused: Sequence[Refusal] = (),
+    refused: Sequence[str] = (),
 ) -> None:
     """Write a COLMAP text model; image names, poses, cameras and matches must already be those of the stored files.
 
@@ -130,7 +130,7 @@ def write_colmap_model(
         model, parameters = colmap_model(camera)
         lens = " ".join(f"{x:.15g}" for x in parameters)
         lenses.append(f"{number} {model} {camera.width} {camera.height} {lens}\n")
-    remarks = [f"# without a pose: {each}\n" for each in refused]
+    remarks = [f"# without a pose: {printable(each)}\n" for each in refused]
     contents = {
         "cameras.txt": ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n", *lenses],
         "points3D.txt": ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n", *listed],

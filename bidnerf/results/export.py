@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -37,11 +38,11 @@ names parts ("surface", "landmarks") without which no map is loaded.
 """
 
 
-def _defects(exporter: Any) -> Iterator[str]:
-    yield from interface_defects(exporter, (), {"__call__": ("scene", "out")})
-
-
-EXPORTERS: Plugins[Exporter] = Plugins("exporters", _defects, first=("ply", "colmap", "transforms.json"))
+EXPORTERS: Plugins[Exporter] = Plugins(
+    "exporters",
+    partial(interface_defects, attributes=(), methods={"__call__": ("scene", "out")}),
+    first=("ply", "colmap", "transforms.json"),
+)
 """The exporters, by the names of their formats."""
 
 

@@ -1,9 +1,6 @@
-"""Pictures of localizations, as 8-bit images and videos: a photo next to the map rendered at the estimated pose."""
+"""Pictures of localizations, as 8-bit images: a photo next to the map rendered at the estimated pose."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -15,7 +12,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields import render_picture
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import reduce_image, write_file
+from bidnerf_core.io import reduce_image
 from bidnerf_core.localization import Localization, SceneMap, Start, origin_of, scene_of, start_pose
 
 PICTURE_SIDE = 240
@@ -62,10 +59,6 @@ class Painter:
         """Render the map with the photo's camera at a pose."""
         T = T_world_camera.translated(-origin_of(self._map))
         return render_picture(self._map.field, self._camera, T, self._map.bounds).rgb
-
-    def blend(self, T_world_camera: SE3) -> UInt8[np.ndarray, "h w 3"]:
-        """Return the photo blended with the rendering, with the edges of each."""
-        return blend(self.observed, self.render(T_world_camera))
 
     def row(
         self, left: Float[Tensor, "h w 3"], left_caption: str, T_world_camera: SE3, caption: str
@@ -120,13 +113,3 @@ def tile(image: ArrayLike | Tensor, caption: str) -> UInt8[np.ndarray, "H W 3"]:
     canvas.paste(picture, (gap // 2, top))
     draw.rectangle((gap // 2 - 1, top - 1, *corner), outline=(214, 216, 220))
     return np.asarray(canvas)
-
-
-def save_gif(path: str | Path, frames: Sequence[ArrayLike | Tensor], fps: float = 8.0) -> None:
-    """Write a looping animation of one or more images (h w 3) of the same size."""
-    import imageio.v3 as iio  # imported here, since few commands draw
-
-    pictures = np.stack([as_picture(frame, f"frame {number}") for number, frame in enumerate(frames)])
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    content = iio.imwrite("<bytes>", pictures, extension=".gif", duration=1000 / fps, loop=0)
-    write_file(Path(path), bytes(content))

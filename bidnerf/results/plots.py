@@ -91,7 +91,6 @@ def write_figure(figure: Any, *paths: Path, dpi: int = 150) -> None:
     The text in the figure, which includes names of files, frames and settings, is made printable and
     truncated to a drawable length.
     """
-    require_matplotlib()
     from matplotlib.text import Text
     from matplotlib.ticker import FuncFormatter
 

@@ -9,10 +9,11 @@ import inspect
 import json
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 from jaxtyping import Float, Int
@@ -37,17 +38,6 @@ class LandmarkMatches:
     pixels: Float[Tensor, "m 2"]  # of the upright image
     landmark: Int[Tensor, "m"]  # index in the map's landmarks
     positions: Float[Tensor, "m 3"]  # of the landmarks, world
-
-
-class Refusal(NamedTuple):
-    """An image without an accepted pose, which files of poses name in comments."""
-
-    name: str
-    outcome: str
-    reason: str
-
-    def __str__(self) -> str:
-        return printable(f"{self.name}: {self.outcome} ({self.reason})")
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +126,7 @@ def time_stamps(images: Sequence[PosedImage]) -> tuple[list[tuple[float, PosedIm
     return sorted(stamped, key=lambda pair: pair[0]), are_times
 
 
-def write_tum(path: Path, images: Sequence[PosedImage], refused: Sequence[Refusal] = ()) -> None:
+def write_tum(path: Path, images: Sequence[PosedImage], refused: Sequence[str] = ()) -> None:
     """A TUM trajectory: rows of time stamp, position, and unit quaternion with the scalar last.
 
     See ``time_stamps`` and https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats. If the stamps are not
@@ -145,7 +135,7 @@ def write_tum(path: Path, images: Sequence[PosedImage], refused: Sequence[Refusa
     stamped, are_times = time_stamps(images)
     rows = [
         f"# timestamp tx ty tz qx qy qz qw ({frame_of(images)})",
-        *(f"# without a pose: {each}" for each in refused),
+        *(f"# without a pose: {printable(each)}" for each in refused),
     ]
     for stamp, image in stamped:
         if not are_times:
@@ -193,17 +183,15 @@ def write_pose_transforms(path: Path, images: Sequence[PosedImage], **more: Any)
     write_file(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
 
 
-def _defects(writer: Any) -> Iterator[str]:
-    yield from interface_defects(writer, (), {"__call__": ("path", "images")})
-
-
 PoseWriter: TypeAlias = Callable[[Path, Sequence[PosedImage]], None]
 """A function that writes poses to a file atomically.
 
-If it takes ``refused`` as well, it also gets the images without an accepted pose, for comments.
+If it takes ``refused`` as well, it also gets a line of text for each image without an accepted pose, for comments.
 """
 
-POSE_WRITERS: Plugins[PoseWriter] = Plugins("writers", _defects)
+POSE_WRITERS: Plugins[PoseWriter] = Plugins(
+    "writers", partial(interface_defects, attributes=(), methods={"__call__": ("path", "images")})
+)
 """Writers by file-name ending; if several match, the longest ending is used.
 
 The first line of a writer's docstring describes its format in lists. ``list_plugins("writers")`` lists the endings without
@@ -222,10 +210,10 @@ def pose_format(path: Path) -> str:
     return ending
 
 
-def write_poses(path: str | Path, images: Sequence[PosedImage], refused: Sequence[Refusal] = ()) -> None:
+def write_poses(path: str | Path, images: Sequence[PosedImage], refused: Sequence[str] = ()) -> None:
     """Write poses in the format selected by the file-name ending.
 
-    Formats with comments list the ``refused`` images. A text file beside it, such as "path.refused.txt", names them in a line each;
+    Formats with comments list the ``refused`` images, which are lines of text. A text file beside it, such as "path.refused.txt", names them in a line each;
     one of an earlier run is replaced. Raises ``InputError`` for an unknown ending, and for images that are not ``PosedImage``.
     """
     path = Path(path)
@@ -239,7 +227,7 @@ def write_poses(path: str | Path, images: Sequence[PosedImage], refused: Sequenc
     write(path, images, **more)
     beside = refused_file(path)
     if refused or beside.exists():
-        write_file(beside, "".join(f"{each}\n" for each in refused).encode())
+        write_file(beside, "".join(f"{printable(each)}\n" for each in refused).encode())
 
 
 def refused_file(path: Path) -> Path:

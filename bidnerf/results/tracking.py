@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections.abc import Callable
 from pathlib import Path
 
 from bidnerf.results.answers import Answer, Answers
 from bidnerf_core.datasets import BreaksOff, Capture, open_sequence
-from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.errors import InputError, InputWarning, amount
 from bidnerf_core.frames import Frame
 from bidnerf_core.localization import (
     Localizer,
@@ -18,6 +19,8 @@ from bidnerf_core.localization import (
     landmark_cameras,
 )
 from bidnerf_core.progress import Cancel, ProgressCallback, counter, job_context
+
+log = logging.getLogger("bidnerf")
 
 
 def track(
@@ -53,7 +56,7 @@ def track(
         sequence = open_sequence(sequence, assumed=landmark_cameras(stored), background=stored.bounds.background)
     if answers is None:
         answers = Answers(tracker.localizer.scene, is_sequence=True, interval=TrackerConfig().frame_seconds)
-    total = -(-len(sequence) // every)
+    total, sources, lost_at = -(-len(sequence) // every), set[str](), None
     with job_context(progress, cancel):
         count = counter("tracking", "frames")
         for number, index in enumerate(range(0, len(sequence), every)):
@@ -70,9 +73,19 @@ def track(
                 answers.unread += 1
             else:
                 frame = timed.frame if depth else timed.frame.replace(depth=None)
-                answer = answers.add(
-                    frame, tracker(frame, timed.time), timed.time, timed.truth, index, sequence.shots[index].file
-                )
+                localization, file = tracker(frame, timed.time), sequence.shots[index].file
+                answer = Answer.of(frame, index, localization, truth=timed.truth, time=timed.time, file=file)
+                answers.append(answer)
+                if frame.camera_source and frame.camera_source not in sources:
+                    sources.add(frame.camera_source)
+                    log.info("%s: %s", frame.name, frame.camera_source)
+                if not localization.converged and lost_at is None:
+                    lost_at = len(answers)
+                    log.info("frame %d (%s): %s: %s", index + 1, frame.name, localization.outcome, localization.reason)
+                elif localization.converged and lost_at is not None:
+                    missed = amount(len(answers) - lost_at, "frame")
+                    log.info("frame %d (%s): tracking again after %s", index + 1, frame.name, missed)
+                    lost_at = None
                 if each is not None:
                     each(timed.frame, answer)
             count(number + 1, total)

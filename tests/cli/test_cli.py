@@ -664,7 +664,7 @@ def test_the_demo_leaves_a_map_and_the_data_that_it_was_made_from(
 ) -> None:
     small = Intrinsics(87.5, 87.5, 32.0, 32.0, 64, 64)
     monkeypatch.setattr(scenes, "views", lambda scene, camera, poses, seen=scenes.views: seen(scene, small, poses))
-    for name, less in (("TRAINING_VIEWS", 12), ("ANIMATED", 2), ("DESCENT", {"rays": 64, "max_steps": 5})):
+    for name, less in (("TRAINING_VIEWS", 12), ("DESCENT", {"rays": 64, "max_steps": 5})):
         monkeypatch.setattr(f"bidnerf.cli.demo.{name}", less)
     monkeypatch.setattr("bidnerf_core.maps.training.USUAL_BAKE", BakeConfig(cells=20_000))
     out = tmp_path / "out"

@@ -26,7 +26,7 @@ from bidnerf.cli import main
 from bidnerf.cli.output import check_folder, check_output
 from bidnerf.cli.running import interruptible_work
 from bidnerf.cli.signals import Interrupted, defer_interruptions, interruptions
-from bidnerf.results import Answers
+from bidnerf.results import Answer, Answers
 from bidnerf_core.datasets import DatasetFrames, Query, read_trajectory
 from bidnerf_core.errors import UsageError
 from bidnerf_core.maps import Map
@@ -255,10 +255,8 @@ def test_a_frame_that_is_not_finite_is_null_and_the_others_are_written(
 
 def test_a_path_of_no_finite_pose_has_no_plot(tmp_path: Path) -> None:
     path = Answers(is_sequence=True)
-    path.add(
-        Frame("a", torch.zeros((3, 4, 3)), CAMERA),
-        replace(FOUND, T_world_camera=SE3(T.rotation, T.translation * math.nan)),
-    )
+    nowhere = replace(FOUND, T_world_camera=SE3(T.rotation, T.translation * math.nan))
+    path.append(Answer.of(Frame("a", torch.zeros((3, 4, 3)), CAMERA), 0, nowhere))
     with pytest.raises(InputError, match="no frame was tracked"):
         path.plot(tmp_path / "plot.png")
 

@@ -27,9 +27,8 @@ from bidnerf.evaluation import (
     comparison_figure,
     list_trials,
     run_trial,
-    trial,
 )
-from bidnerf.evaluation.comparison import MapRow, map_bytes, run_and_sample
+from bidnerf.evaluation.comparison import MapRow, map_bytes
 from bidnerf.evaluation.run import InThisProcess, local_processes, terminate_on_failure
 from bidnerf.evaluation.summary import success_of
 from bidnerf_core.datasets import open_dataset
@@ -63,11 +62,6 @@ def maps(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 @pytest.fixture(scope="module")
 def plan() -> Plan:
     return Plan(protocol="bid", sizes=[0.5], method="bid", config=QUICK, trials=2)
-
-
-@pytest.fixture(scope="module")
-def usual(maps: list[Path], data: Path) -> Trial:
-    return Trial(str(maps[0]), str(data), ("t_0000",), (0.5,), protocol="bid", method="bid", config=QUICK)
 
 
 @pytest.fixture(scope="module")
@@ -110,29 +104,13 @@ def test_a_process_elsewhere_takes_no_file_of_the_folder_for_a_module(compared: 
     assert [r.steps for column in compared.results for r in column] == [3] * 4
 
 
-def test_a_process_keeps_one_map(usual: Trial) -> None:
-    """Its memory is run_and_sample as that of one."""
-    trial._read_scene.cache_clear()
-    run_and_sample(usual)
-    assert trial._read_scene.cache_info().currsize == 1
-
-
 def test_a_row_says_what_the_map_costs(compared: Comparison, maps: list[Path]) -> None:
     assert [r.map for r in compared.rows] == ["short", "long"]
     for found, folder in zip(compared.rows, maps, strict=True):
         assert found.map_bytes == map_bytes(folder) == sum(f.stat().st_size for f in folder.iterdir())
         assert found.peak_memory_bytes > 50 * 2**20  # a Python with torch in it
         assert found.ms_per_step > 0
-        assert 0 < found.samples_per_ray < 1000
         assert found.steps == 3
-
-
-def test_samples_are_those_of_the_level_that_the_method_uses(maps: list[Path], usual: Trial) -> None:
-    trial = replace(usual, map=str(maps[1]), frames=("t_0000",))
-    fine = replace(trial, config=json.dumps(json.loads(QUICK) | {"level": None}))
-    coarse = replace(trial, config=json.dumps(json.loads(QUICK) | {"level": 0}))
-    assert run_and_sample(trial)[1] == run_and_sample(coarse)[1]
-    assert run_and_sample(fine)[1] > 0
 
 
 def test_speed_is_that_of_the_trials_that_succeeded() -> None:
@@ -154,13 +132,13 @@ def test_a_title_counts_trials_and_starts() -> None:
 
 def test_a_median_error_counts_lost_poses_as_worst() -> None:
     good, gone = result(0.1, [1.0, 0.1]), replace(result(0.1, [1.0, 0.1]), error=None)
-    assert MapRow.of("a", 0, [good, good, gone], [1.0] * 3).translation == pytest.approx(0.01)
-    assert MapRow.of("a", 0, [good, gone, gone], [1.0] * 3).translation is None
+    assert MapRow.of("a", 0, [good, good, gone]).translation == pytest.approx(0.01)
+    assert MapRow.of("a", 0, [good, gone, gone]).translation is None
 
 
 def test_without_a_start_there_is_no_share_of_its_error(tmp_path: Path) -> None:
     free = replace(result(1.0, [0.04, 0.01]), start_error=None)
-    row = MapRow.of("short", 0, [free], [1.0])
+    row = MapRow.of("short", 0, [free])
     assert row.success["10%"] is None
     absolute = require(row.success["5deg 0.05"])
     assert (absolute.rate.successes, absolute.steps) == (1, 0)

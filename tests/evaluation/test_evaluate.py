@@ -183,7 +183,7 @@ def test_results_say_where_a_map_in_memory_computed(monkeypatch: pytest.MonkeyPa
         seen.append(trial.device)
         raise LookupError("no trial is run")
 
-    for module, name in (("run", "run_trial"), ("comparison", "run_and_sample")):
+    for module, name in (("run", "run_trial"), ("comparison", "run_trial")):
         monkeypatch.setattr(import_module(f"bidnerf.evaluation.{module}"), name, stop)
     for begin in (
         lambda: bn.evaluate(elsewhere, tiny.views(2), quick(trials=1)),

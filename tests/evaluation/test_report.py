@@ -418,7 +418,7 @@ def test_warnings_of_other_libraries_cannot_control_the_terminal(
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_report_links_to_the_frames_from_the_worst_to_the_best(tmp_path: Path) -> None:
-    first = ResultTable.load(Path(__file__).with_name("earlier_results.jsonl")).rows[0]
+    first = trial_result(Trial("house", "photos", ("a",)), [0.1])
     near, far, hostile = ScalarPoseError(0.01, 1.0), ScalarPoseError(0.3, 1.0), "<script>alert(1)</script>"
     rows = [
         dataclasses.replace(first, converged=accepted, error=error, frame=frame, trial=trial)

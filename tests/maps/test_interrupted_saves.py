@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeAlias
 
-import numpy as np
 import pytest
 import torch
 
@@ -22,7 +21,7 @@ from bidnerf.evaluation import (
     provenance,
     read_runs,
 )
-from bidnerf.results import Answer, Answers, PosedImage, new_figure, save_gif, write_figure
+from bidnerf.results import Answer, Answers, PosedImage, new_figure, write_figure
 from bidnerf.results.pose_files import POSE_WRITERS
 from bidnerf_core.captures import write_inria_cameras
 from bidnerf_core.io import is_temporary, write_file
@@ -92,7 +91,6 @@ SAVERS: dict[str, Saver] = {
         lambda folder: [run.workers for run in read_runs(folder / "r.jsonl")] or None,
     ),
     "figure": file("a.png", lambda path, n: write_figure(new_figure(n, 1), path)),
-    "animation": file("a.gif", lambda path, n: save_gif(path, [np.zeros((4, 4, 3))] * n)),
     "tracker": file("state", lambda path, n: save_state(path, TrackerState(Clock(None, float(n))), "map")),
     "cameras": file("cameras.json", lambda path, n: write_inria_cameras(path.parent, CAMERAS[:n])),
 }

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
 
-from bidnerf.results import as_picture, save_gif, tile
+from bidnerf.results import as_picture, tile
 
 # Inside: single tiles of an overlay, before they are put together
 from bidnerf.results.overlays import blend, edges
@@ -65,13 +62,3 @@ def test_edges_are_where_the_image_changes() -> None:
 def test_small_images_are_enlarged_and_large_ones_are_not() -> None:
     assert tile(disc(20), "small").shape[1] > 200
     assert tile(np.zeros((300, 400, 3)), "large").shape[1] < 420
-
-
-def test_gif_keeps_frames_and_speed(tmp_path: Path) -> None:
-    path = tmp_path / "new" / "a.gif"
-    save_gif(path, [disc(x) for x in (8, 14, 20)], fps=5)
-    frames = iio.imread(path)
-    assert frames.shape == (3, 40, 40, 3)
-    assert iio.immeta(path)["duration"] == pytest.approx(200)
-    assert iio.immeta(path)["loop"] == 0
-    assert np.abs(frames[2].astype(int) - as_picture(disc(20))).mean() < 3

@@ -284,16 +284,6 @@ def test_what_is_localized_may_be_given_in_any_form(folder: Path) -> None:
         bn.localize(known, [7])  # type: ignore[list-item]
 
 
-def test_answers_count_on_after_failures() -> None:
-    frame, answers = Frame("a", torch.zeros((3, 4, 3)), CAMERA), Answers(is_sequence=True)
-    for _ in range(2):
-        answers.append(Failure("b", "auto", "no such file"))
-        answers.add(frame, FOUND)
-    answers.add(frame, FOUND, number=9)
-    answers.add(frame, FOUND)
-    assert [answer.number for answer in answers.answers] == [1, 3, 9, 10]
-
-
 def answers_with(poses: list[SE3], truths: list[SE3]) -> Answers:
     found, frame = replace(FOUND, outcome=Outcome.CONVERGED), Frame("a", torch.zeros((3, 4, 3)), CAMERA)
     answers = Answers()

@@ -8,6 +8,9 @@ from typing import Any
 
 from bidnerf.evaluation import ScalarPoseError, Trace, Trial, TrialResult
 
+# Inside: the digests of images that there are not
+from bidnerf.evaluation.trial import InputDigests
+
 
 def trial_result(trial: Trial, distances: Sequence[float], angles: Sequence[float] = (), **changes: Any) -> TrialResult:
     """Return the result of a trial whose errors went like that, from the start on (metres, degrees); ``changes`` are
@@ -34,10 +37,13 @@ def trial_result(trial: Trial, distances: Sequence[float], angles: Sequence[floa
         {},
         "weights-1",
         trial,
+        "converged",
+        InputDigests("0"),
+        1.0,
     )
     return replace(made, **changes)
 
 
 def timeless(rows: Iterable[TrialResult]) -> list[TrialResult]:
     """Return results without the values in which two runs differ."""
-    return [replace(row, seconds=0.0, cpu_seconds=None, peak_memory_bytes=0) for row in rows]
+    return [replace(row, seconds=0.0, cpu_seconds=0.0, peak_memory_bytes=0) for row in rows]
