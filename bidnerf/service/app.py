@@ -22,6 +22,7 @@ from bidnerf.service.pool import Pool
 from bidnerf.service.protocols import SERVICES, ServiceProtocol
 from bidnerf.service.settings import ServiceLimits
 from bidnerf.service.web import (
+    FAILED,
     OPEN,
     Application,
     await_result,
@@ -186,7 +187,8 @@ async def _ask_worker(request: Request, task: dict[str, Any]) -> Any:
     pool.outcomes.labels(map=map or "", outcome=answer["outcome"]).inc()
     facts |= {key: answer[key] for key in ("outcome", "worker", "fault") if key in answer}
     if answer["status"] != 200:
-        raise Refused(answer["status"], answer["detail"], None, **answer.get("more", {}))
+        detail = answer["detail"] or FAILED.format(request.state.id)
+        raise Refused(answer["status"], detail, None, **answer.get("more", {}))
     return answer["body"]
 
 

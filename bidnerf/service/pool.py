@@ -122,7 +122,7 @@ class Pool:
                         worker.stopped = str(error) or "cancelled"
                         worker.kill()
                         raise
-        raise Refused(422, "the request crashed every worker that took it")
+        raise Refused(422, "each of three workers that read this request ended; is the photo damaged, or memory short?")
 
     async def start(self) -> None:
         """Load the maps and fork the workers. Raises ``InputError`` if the maps cannot be served."""

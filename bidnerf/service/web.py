@@ -67,6 +67,8 @@ ERRORS = {
     504: ("Took too long", "The answer took too long."),
 }
 """Titles and descriptions of errors, by HTTP status."""
+FAILED = "the service failed; its log names the cause under the id {}"
+"""The detail of an internal error, whose cause may name paths of this machine."""
 FaultReport = Callable[[Scope, int, float, Exception | None], None]
 """A function that receives the scope, the status, the duration (seconds) and the internal error of each request."""
 
@@ -181,7 +183,7 @@ class Gate:
         except Exception as error:  # an internal error: the operator has to see where it happened
             fault = error
             if not status:
-                await problem(500, "internal error")(served, receive, answer)
+                await problem(500, FAILED.format(number))(served, receive, answer)
         except asyncio.CancelledError:  # the server stops, and nothing waits for the end of this task
             if not status:
                 more = {"Retry-After": "5", "Connection": "close"}
@@ -210,8 +212,7 @@ class Gate:
 
 def problem(status: int, detail: str, headers: Mapping[str, str] | None = None, **more: Any) -> Response:
     """Return an error response in the format of RFC 9457."""
-    title = ERRORS[status][0] if status in ERRORS else "Error"
-    body = {"title": title, "status": status, "detail": detail, **more}
+    body = {"title": ERRORS.get(status, ("Error",))[0], "status": status, "detail": detail, **more}
     return Response(json.dumps(body), status, headers, PROBLEM)
 
 

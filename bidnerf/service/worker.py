@@ -17,7 +17,7 @@ import sys
 from collections.abc import Mapping
 from io import BufferedRWPair
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from pydantic import BaseModel
 
@@ -39,16 +39,15 @@ class LoadedMaps:
     def __init__(self, localizers: Mapping[str, Localizer], max_pixels: float) -> None:
         """Store the localizers by map name; several maps form a collection, for photos whose map is not known."""
         self.localizers, self.max_pixels, first = localizers, max_pixels, next(iter(localizers.values()))
+        self.scenes = {name: cast(Map, localizer.scene) for name, localizer in localizers.items()}
         self.together: MapCollection | None = None
         if len(localizers) > 1:
-            scenes = {name: _scene(localizer) for name, localizer in localizers.items()}
-            self.together = MapCollection(scenes, first.method, first.config, localizers=dict(localizers))
+            self.together = MapCollection(self.scenes, first.method, first.config, localizers=dict(localizers))
 
     def describe(self) -> dict[str, Any]:
         """Return the facts about each map that clients may see, by map name; the other facts reveal photos and folders."""
         described = dict[str, Any]()
-        for name, localizer in self.localizers.items():
-            scene = _scene(localizer)
+        for name, scene in self.scenes.items():
             facts = scene.describe().plain() | {"anchor": to_plain(scene.anchor), "backend": scene.info.backend or None}
             described[name] = {key: facts[key] for key in MapFacts.model_fields}
         return described
@@ -71,14 +70,14 @@ class LoadedMaps:
                 _, body = localize(task["upload"])
             else:
                 given = _validated(SERVICES[protocol].request, task["body"])
-                body = SERVICES[protocol].answer(given, _scene(self.localizers[task["map"]]), localize)
+                body = SERVICES[protocol].answer(given, self.scenes[task["map"]], localize)
             reply: dict[str, Any] = {"status": 200, "body": body}
         except Refused as error:
             reply = {"status": error.status, "detail": error.detail, "more": error.more}
         except InputError as error:
             reply = {"status": 422, "detail": public_message(error, folder)}
         except Exception as error:  # the worker goes on, and the log states what happened
-            reply = {"status": 500, "detail": "internal error", "fault": f"{type(error).__name__}: {error}"}
+            reply = {"status": 500, "detail": "", "fault": f"{type(error).__name__}: {error}"}
         return reply | {"outcome": outcomes[-1] if outcomes else "bad input" if reply["status"] < 500 else "fault"}
 
     def localize(self, name: str | None, upload: Upload, folder: Path) -> tuple[Answer, dict[str, Any]]:
@@ -108,11 +107,6 @@ def _validated(model: type[BaseModel], body: bytes) -> Any:
     except InputError as error:
         raise Refused(400, str(error)) from error
     return given
-
-
-def _scene(localizer: Localizer) -> Map:
-    assert isinstance(localizer.scene, Map)
-    return localizer.scene
 
 
 def main() -> None:
@@ -181,7 +175,7 @@ def _serve(maps: LoadedMaps, device: str, stream: BufferedRWPair) -> None:
     try:
         if device != "cpu":
             moved = {
-                name: Localizer(_scene(each), each.method, each.config, device)
+                name: Localizer(maps.scenes[name], each.method, each.config, device)
                 for name, each in maps.localizers.items()
             }
             maps = LoadedMaps(moved, maps.max_pixels)

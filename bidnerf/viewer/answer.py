@@ -231,16 +231,19 @@ def _steps(localization: Localization, record: SearchRecord | None) -> tuple[Jso
     if answer is not None and len(answer.modes) > 1:  # the pose and its rivals
         _, poses, probabilities = zip(*probable_poses(answer), strict=True)
         scores = (-torch.tensor(probabilities, dtype=torch.float64).log()).tolist()
-        caption = "the pose and others that explain the image"
-        shown.append(_step(caption, SE3.stack(list(poses)), scores, len(poses)))
+        shown.append(_step("the pose and others that explain the image", SE3.stack(list(poses)), scores, len(poses)))
     return (*shown, _step(HERE, last[None], [0.0], 1, shown[-1]["loss"] if shown else None))
 
 
 def _step(caption: str, T: SE3, scores: list[float], retained: int, loss: float | None = None) -> JsonObject:
     """Return one step: the poses that were considered together, the best first, their scores, how many were retained, and the ``loss`` of a descent."""
-    poses = pack(T.matrix()[:, :3].detach().cpu().double().flatten(1).numpy())
-    known = tuple(map(_finite, scores))
-    return {"caption": caption, "poses": poses, "scores": known, "retained": retained, "loss": _finite(loss)}
+    return {
+        "caption": caption,
+        "poses": pack(T.matrix()[:, :3].detach().cpu().double().flatten(1).numpy()),
+        "scores": tuple(map(_finite, scores)),
+        "retained": retained,
+        "loss": _finite(loss),
+    }
 
 
 def _finite(value: float | None) -> float | None:

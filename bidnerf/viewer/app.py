@@ -106,7 +106,9 @@ class ShownJob:
             self.answer = no_answer(self.name, BAD_INPUT, str(error))
         except Exception:  # third-party code may raise anything, with paths of this machine in it
             log.exception("internal error while localizing %s", self.name)
-            self.answer = no_answer(self.name, "fault", "internal error, which the viewer's log describes")
+            self.answer = no_answer(
+                self.name, "fault", "the viewer failed; its log names the cause, beside the name of the image"
+            )
         finally:
             self.state = "done"
 

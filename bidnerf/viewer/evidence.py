@@ -88,13 +88,13 @@ def _compare_cameras(localization: Localization, answer: LandmarkAnswer) -> Json
     own = posterior.probability * (posterior.states.mode == posterior.mode)
     shown = dict[str, float]()
     for row, probability in zip(posterior.states.row.tolist(), (own / own.sum()).tolist(), strict=True):
-        camera = names[row].removesuffix(MOVING)
-        name = CAMERAS[camera] + (", with rolling shutter" if names[row].endswith(MOVING) else "")
+        name = CAMERAS[names[row].removesuffix(MOVING)]
+        name += ", with rolling shutter" if names[row].endswith(MOVING) else ""
         shown[name] = shown.get(name, 0.0) + probability
     # Explanations that are less probable than one in a thousand are not listed.
     likely = [each for each in sorted(shown.items(), key=lambda each: -each[1]) if each[1] >= 0.001]
-    pose = name_earlier(localization, answer)
-    return _contest("Whose camera took it?", likely, f"Weighed at {pose}." if pose else "", of_pose=False)
+    note = f"Weighed at {EARLIER}." if name_earlier(localization, answer) else ""
+    return _contest("Whose camera took it?", likely, note, of_pose=False)
 
 
 def _compare_rivals(support: Support) -> JsonObject:

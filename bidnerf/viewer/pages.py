@@ -121,8 +121,7 @@ def view(
     scene_map = require_map(scene)
     answers = list[JsonObject]()
     if localization is not None:
-        name = "localization" if frame is None else frame.name
-        answer = answer_json(scene_map, name, localization, frame)
+        answer = answer_json(scene_map, "localization" if frame is None else frame.name, localization, frame)
         answers.append(answer if frame is None else add_renderings(answer, scene_map, localization, frame))
     elif frame is not None:
         localizer = scene if isinstance(scene, Localizer) else Localizer(scene_map)

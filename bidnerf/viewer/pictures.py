@@ -18,6 +18,7 @@ from bidnerf.results import as_picture
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import has_field, render_image
 from bidnerf_core.geometry import SE3
+from bidnerf_core.io import png_bytes
 from bidnerf_core.localization import SceneMap, picture_at, surface_renderer
 
 JsonObject: TypeAlias = dict[str, Any]
@@ -61,9 +62,7 @@ def jpeg_json(image: Float[Tensor, "h w 3"]) -> JsonObject:
 
 def png_json(image: UInt8[np.ndarray, "h w channels"]) -> JsonObject:
     """Return an image, with or without an alpha channel, in the format of ``jpeg_json`` but encoded as PNG."""
-    file = io.BytesIO()
-    Image.fromarray(image).save(file, "PNG", optimize=True)
-    url = "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()
+    url = "data:image/png;base64," + base64.b64encode(png_bytes(image)).decode()
     return {"url": url, "width": image.shape[1], "height": image.shape[0]}
 
 

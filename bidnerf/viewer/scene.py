@@ -96,8 +96,7 @@ def matrix_rows(T: SE3) -> tuple[float, ...]:
 def _facts(scene: Map) -> tuple[tuple[str, str], ...]:
     up = scene.up
     surfels = 0 if scene.surface is None else len(scene.surface.surfels)
-    x, y, z = scene.origin
-    offset = (("origin", f"positions shown here are relative to ({x:,.0f}, {y:,.0f}, {z:,.0f})"),)
+    offset = (("origin", "positions shown here are relative to ({:,.0f}, {:,.0f}, {:,.0f})".format(*scene.origin)),)
     landmarks = 0 if scene.landmarks is None else len(scene.landmarks)
     return (
         ("backend", scene.info.backend if scene.has_field else "no field; landmarks alone"),

@@ -789,8 +789,9 @@ def test_an_internal_error_is_one_line_of_the_log(
 
     monkeypatch.setattr(service.pool, "answer", fail)
     reply = service.post("/localize?map=map", inputs.photo)
-    assert (reply.status, reply.json["detail"]) == (500, "internal error")
     (line,) = (json.loads(record.message) for record in caplog.records if record.name == "bidnerf.service")
+    detail = f"the service failed; its log names the cause under the id {line['id']}"
+    assert (reply.status, reply.json["detail"]) == (500, detail)
     assert (line["status"], line["path"], line["fault"]) == (500, "/localize", "RuntimeError: /home/user/secret")
     assert "in fail" in line["traceback"]
 
