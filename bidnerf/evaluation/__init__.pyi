@@ -41,6 +41,7 @@ from .summary import group_results as group_results
 from .summary import median as median
 from .summary import steps_of as steps_of
 from .summary import summarize as summarize
+from .trial import InputDigests as InputDigests
 from .trial import ScalarPoseError as ScalarPoseError
 from .trial import Trace as Trace
 from .trial import TrialResult as TrialResult

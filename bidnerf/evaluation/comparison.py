@@ -21,7 +21,7 @@ from bidnerf.evaluation.run import (
     local_processes,
     terminate_on_failure,
 )
-from bidnerf.evaluation.summary import ABSOLUTE, RELATIVE, Summary, summarize
+from bidnerf.evaluation.summary import ABSOLUTE, RELATIVE, Summary, number_text, summarize
 from bidnerf.evaluation.trial import (
     MapSource,
     TrialResult,
@@ -73,21 +73,17 @@ class MapRow(Summary):
         return {
             "backend": self.backend,
             **rates,
-            "median error": f"{_number(self.translation, 4)} {symbol(self.unit)}",
-            "median error, deg": _number(self.rotation_deg, 2),
+            "median error": f"{number_text(self.translation, 4)} {symbol(self.unit)}",
+            "median error, deg": number_text(self.rotation_deg, 2),
             "CPU s a trial": f"{self.cpu_seconds:.2f}",
             "s a trial": f"{self.seconds:.2f}",
             "steps": f"{self.steps:g}",
-            "steps to success": _number(usual.steps, 0),
+            "steps to success": number_text(usual.steps, 0),
             "ms a step": f"{self.ms_per_step:.1f}",
-            "ms to success": _number(usual.milliseconds, 0),
+            "ms to success": number_text(usual.milliseconds, 0),
             "peak memory, MiB": f"{self.peak_memory_bytes / 2**20:.0f}",
             "map, MiB": f"{self.map_bytes / 2**20:.1f}",
         }
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
 
 
 @dataclass(frozen=True)

@@ -138,14 +138,14 @@ def find_protocol(name: str) -> Protocol:
 # Trials.
 
 
-def _read_options(options: DatasetOptions | dict[str, Any]) -> DatasetOptions:
-    return options if isinstance(options, DatasetOptions) else DatasetOptions(**options)
-
-
 StoredOptions = Annotated[
     DatasetOptions,
     # pydantic cannot resolve the annotations of ``DatasetOptions``, which names types that it does not import.
-    GetPydanticSchema(lambda kind, handler: core_schema.no_info_plain_validator_function(_read_options)),
+    GetPydanticSchema(
+        lambda kind, handler: core_schema.no_info_plain_validator_function(
+            lambda given: given if isinstance(given, DatasetOptions) else DatasetOptions(**given)
+        )
+    ),
 ]
 
 
@@ -237,14 +237,10 @@ class Plan(Setup, Settings):
     seed: Annotated[int, WholeNumbers(0, LARGEST_SEED)] | None = None
     frames: Sequence[str] | None = None  # use only these
     faults: Sequence[str] = (NO_FAULT,)  # each is applied to the same frames from the same starts
-    shard: int = 0  # the part to run, of ``shards``: every ``shards``-th trial
-    shards: Annotated[int, WholeNumbers(1, MOST_TRIALS)] = 1
 
     def __post_init__(self) -> None:
         Setup.__post_init__(self)
         Settings.__post_init__(self)
-        if not 0 <= self.shard < self.shards:
-            raise InputError(f"shard is {self.shard}", expected=f"0 to {self.shards - 1}")
         config = self.config
         if not isinstance(config, str):
             settings = settings_of(self.method, dict(config)) if isinstance(config, Mapping) else config
@@ -285,7 +281,7 @@ def parse_settings(method: str, config: str) -> Any:
 
 
 def list_trials(plan: Plan, map: str, data: str, dataset: Capture) -> list[Trial]:
-    """Return the trials of a plan, or of its shard, in the order of the results.
+    """Return the trials of a plan, in the order of the results.
 
     ``map`` and ``data`` are the names of the map and of ``dataset``. Frames that masks hide entirely are not tried, with
     an ``InputWarning``. Raises ``InputError`` for a plan that cannot be carried out.
@@ -312,10 +308,9 @@ def list_trials(plan: Plan, map: str, data: str, dataset: Capture) -> list[Trial
     count = protocol.trials if plan.trials is None else plan.trials
     cases = protocol.cases(len(visible), count, protocol.seed if plan.seed is None else plan.seed)
     shared = {field.name: getattr(plan, field.name) for field in fields(Setup)}
-    every = [
+    return [
         Trial(map, data, (visible[index],), size, seed, fault, **shared)
         for fault in plan.faults
         for size in plan.starts()
         for index, seed in cases
     ]
-    return every[plan.shard :: plan.shards]

@@ -25,6 +25,7 @@ from bidnerf.evaluation.summary import (
     applies,
     are_stepwise,
     is_right,
+    number_text,
     situations,
     unit_of_results,
 )
@@ -112,7 +113,7 @@ def render_page(
         undefined=StrictUndefined,
         keep_trailing_newline=True,
     )
-    environment.filters["number"] = _number
+    environment.filters["number"] = number_text
     source = files(__package__).joinpath("report.html.jinja").read_text(encoding="utf-8")
     template = environment.from_string(source.strip() + "\n")
     groups = table.groups
@@ -173,13 +174,6 @@ def add_images(rows: Sequence[TrialResult], data: Sequence[str | Path]) -> list[
         image.save(content, "JPEG", quality=80)
         pairs.append((row, base64.b64encode(content.getvalue()).decode()))
     return pairs
-
-
-def _number(value: float | None, digits: int | None = None, unit: str = "") -> str:
-    """Return a number as text, with a dash in place of an unknown one."""
-    if value is None:
-        return "\N{EN DASH}"
-    return f"{value:g}{unit}" if digits is None else f"{value:.{digits}f}{unit}"
 
 
 def _describe_runs(name: str, runs: Sequence[Provenance]) -> dict[str, str]:

@@ -266,3 +266,10 @@ def median(values: Iterable[float | None]) -> float | None:
     known = [math.inf if value is None else float(value) for value in values]
     middle = statistics.median(known) if known else math.inf
     return middle if math.isfinite(middle) else None
+
+
+def number_text(value: float | None, digits: int | None = None, unit: str = "") -> str:
+    """Return a number as text, with a dash in place of an unknown one."""
+    if value is None:
+        return "\N{EN DASH}"
+    return f"{value:g}{unit}" if digits is None else f"{value:.{digits}f}{unit}"

@@ -67,13 +67,11 @@ def images_by_file(images: Sequence[PosedImage]) -> list[PosedImage]:
     """Return the images as their files store them, each named by its file's path relative to the folder that contains all of them."""
     files = [image.file for image in images if image.file is not None]
     folder = os.path.commonpath([file.resolve().parent for file in files]) if files else ""
-    stored = list[PosedImage]()
-    for image in images:
-        name = image.name
-        if image.file is not None:
-            name = Path(os.path.relpath(image.file.resolve(), folder)).as_posix()
-        stored.append(replace(image.as_stored, name=name))
-    return stored
+    names = [
+        image.name if image.file is None else Path(os.path.relpath(image.file.resolve(), folder)).as_posix()
+        for image in images
+    ]
+    return [replace(image.as_stored, name=name) for image, name in zip(images, names, strict=True)]
 
 
 def _is_same(one: Intrinsics, other: Intrinsics) -> bool:
@@ -128,14 +126,13 @@ def write_colmap_model(
     lenses = list[str]()
     for camera, number in cameras.items():
         model, parameters = colmap_model(camera)
-        lens = " ".join(f"{x:.15g}" for x in parameters)
-        lenses.append(f"{number} {model} {camera.width} {camera.height} {lens}\n")
-    remarks = [f"# without a pose: {printable(each)}\n" for each in refused]
+        lens = [f"{x:.15g}" for x in parameters]
+        lenses.append(" ".join([f"{number} {model} {camera.width} {camera.height}", *lens]) + "\n")
     contents = {
         "cameras.txt": ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n", *lenses],
         "points3D.txt": ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n", *listed],
         path.name: [
-            *remarks,
+            *(f"# without a pose: {printable(each)}\n" for each in refused),
             "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then POINTS2D[] as (X, Y, POINT3D_ID)\n",
             *rows,
         ],

@@ -164,11 +164,18 @@ class Rate:
         return f"{self.rate:.1%} ({count}{on}; {self.low:.1%} to {self.high:.1%})"
 
 
-def success_rate(successes: int, trials: int) -> Rate:
-    """Return the success rate of independent trials with Wilson's 95 % interval (Wilson 1927)."""
+def success_rate(successes: int, trials: int, effective: float = 0.0, frames: int | None = None) -> Rate:
+    """Return the success rate of trials with Wilson's 95 % interval (Wilson 1927).
+
+    ``effective`` is the number of independent trials, which need not be an integer, by default ``trials``.
+    """
     if not (trials >= 1 and 0 <= successes <= trials):
         raise InputError(f"{successes} of {trials}", where="success rate", expected="0 to n of at least one trial")
-    return _with_interval(successes, trials, trials)
+    share, z, n = successes / trials, NormalDist().inv_cdf(0.975), effective or trials
+    middle = (share + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * math.sqrt(share * (1 - share) / n + (z / (2 * n)) ** 2)
+    low, high = min(middle - half, share), max(middle + half, share)  # up to rounding
+    return Rate(successes, trials, max(low, 0.0), min(high, 1.0), frames)
 
 
 def success_rate_by_frame(outcomes: Sequence[bool], frames: Sequence[Hashable]) -> Rate:
@@ -197,16 +204,7 @@ def success_rate_by_frame(outcomes: Sequence[bool], frames: Sequence[Hashable]) 
         correction = float(quantiles[0] / quantiles[1]) ** 2
         size = correction * share * (1 - share) / variance if variance > 0 else math.inf
         effective = min(max(size, 1.0), float(trials))
-    return _with_interval(successes, trials, effective, count)
-
-
-def _with_interval(successes: int, trials: int, effective: float, frames: int | None = None) -> Rate:
-    """Return a rate with Wilson's interval for ``effective`` independent trials, which need not be an integer."""
-    share, z = successes / trials, NormalDist().inv_cdf(0.975)
-    middle = (share + z * z / (2 * effective)) / (1 + z * z / effective)
-    half = z / (1 + z * z / effective) * math.sqrt(share * (1 - share) / effective + (z / (2 * effective)) ** 2)
-    low, high = min(middle - half, share), max(middle + half, share)  # up to rounding
-    return Rate(successes, trials, max(low, 0.0), min(high, 1.0), frames)
+    return success_rate(successes, trials, effective, count)
 
 
 @dataclass(frozen=True)

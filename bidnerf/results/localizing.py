@@ -147,8 +147,7 @@ def _log_depth(query: Query, sensor: str) -> None:
     bare = [view.frame.name for view in query.views if not view.frame.has_depth]
     if bare and query.truth is not None:
         log.info("%s: no measured depth; colour only", ", ".join(bare))
-    shown = query.frame
-    if sensor != "unknown" and shown.depth is not None and shown.has_depth:
-        remark = describe_depth_noise(shown.depth, shown.intrinsics, sensor)
-        if remark is not None:
-            log.info("%s: %s", query.name, remark)
+    depth = query.frame.depth if query.frame.has_depth and sensor != UNKNOWN_SENSOR else None
+    remark = None if depth is None else describe_depth_noise(depth, query.frame.intrinsics, sensor)
+    if remark is not None:
+        log.info("%s: %s", query.name, remark)

@@ -78,14 +78,13 @@ class PosedImage:
         if orientation == UPRIGHT:
             return self
         # The columns are the stored image's axes in the upright camera's frame.
-        x, y = (-1.0 if flips else 1.0 for flips in (orientation.mirrors_columns, orientation.mirrors_rows))
+        x_flips, y_flips = orientation.mirrors_columns, orientation.mirrors_rows
+        x, y = (-1.0 if flips else 1.0 for flips in (x_flips, y_flips))
         axes = [[0.0, y, 0.0], [x, 0.0, 0.0]] if orientation.transposes else [[x, 0.0, 0.0], [0.0, y, 0.0]]
         turn = torch.tensor([*axes, [0.0, 0.0, 1.0]], dtype=torch.float64)
         if float(torch.linalg.det(turn)) < 0:
             raise InputError("is stored mirrored, which this format cannot describe", where=self.file)
-        inverse = Orientation(orientation.mirrors_columns, orientation.mirrors_rows)
-        if orientation.transposes:
-            inverse = Orientation(orientation.mirrors_rows, orientation.mirrors_columns, True)
+        inverse = Orientation(y_flips, x_flips, True) if orientation.transposes else Orientation(x_flips, y_flips)
         T_upright_stored = SE3(turn, torch.zeros(3, dtype=torch.float64))
         stored, matches = self.intrinsics.upright(inverse), self.matches
         if matches is not None:
@@ -160,8 +159,7 @@ def write_pose_json(path: Path, images: Sequence[PosedImage]) -> None:
             key: None if m is None or not bool(m.isfinite().all()) else m.double().cpu().tolist()
             for key, m in matrices.items()
         }
-        entry = {"frame": image.name, "time": image.time, **rows, "unit": image.unit}
-        entries.append(json.dumps(entry, allow_nan=False))
+        entries.append(json.dumps({"frame": image.name, "time": image.time, **rows, "unit": image.unit}))
     write_file(path, ("[\n" + ",\n".join(entries) + "\n]\n").encode())
 
 
@@ -177,8 +175,7 @@ def write_pose_transforms(path: Path, images: Sequence[PosedImage], **more: Any)
         stored, file = image.as_stored, image.name
         if image.file is not None:
             file = os.path.relpath(image.file.resolve(), path.parent.resolve())
-        entry = frame_entry(Path(file).as_posix(), image.name, stored.intrinsics, stored.pose, image.time)
-        frames.append(entry)
+        frames.append(frame_entry(Path(file).as_posix(), image.name, stored.intrinsics, stored.pose, image.time))
     content = {"camera_model": "OPENCV", "unit": common_unit(images), "frames": frames, **more}
     write_file(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
 

@@ -80,16 +80,6 @@ def test_a_plan_is_its_protocol_for_each_size() -> None:
     assert (odd.device, odd.depth) == ("cpu:0", False)
 
 
-@pytest.mark.parametrize("shards", [1, 3, 13])
-def test_shards_share_all_trials_between_them(shards: int) -> None:
-    few = {"trials": 4}
-    parts = [trials_of(shard=number, shards=shards, **few) for number in range(shards)]
-    assert sorted((t.seed, t.size) for p in parts for t in p) == sorted((t.seed, t.size) for t in trials_of(**few))
-    assert max(map(len, parts)) - min(map(len, parts)) <= 1
-    with refused(found=f"shard is {shards}", expected=f"0 to {shards - 1}"):
-        Plan(shard=shards, shards=shards)
-
-
 @pytest.mark.parametrize(
     ("change", "found", "expected"),
     [

@@ -212,25 +212,3 @@ def test_the_command_prints_a_table_and_writes_what_it_says(
     found = strict(bidnerf("compare", maps[0], data, *quick, "--size", 0.3, "--frame", "t_0001", "--json").out)
     assert found["size"] == [0.3]
     assert found["rows"][0]["success"]["10%"]["rate"]["trials"] == 2
-
-
-@pytest.mark.parametrize(
-    ("words", "status", "expected"),
-    [
-        (["{map}"], 2, "1 folder given, expected"),
-        (["{map}", "{data}", "--frame", "r_77"], 1, "r_77"),
-        (["{map}", "{data}", "--protocol", "bib"], 2, "did you mean 'bid'"),
-        (["{data}", "{data}"], 1, "expected a map"),
-        (["{map}", "{map}", "{data}"], 2, "two maps are named"),
-    ],
-)
-def test_mistakes_are_told_before_the_work_begins(
-    words: list[str],
-    status: int,
-    expected: str,
-    maps: list[Path],
-    data: Path,
-    bidnerf: Run,
-) -> None:
-    given = [word.format(map=maps[0], data=data) for word in words]
-    assert_refused(bidnerf("compare", *given), status, expected)

@@ -6,10 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from bidnerf.evaluation import ScalarPoseError, Trace, Trial, TrialResult
-
-# Inside: the digests of images that there are not
-from bidnerf.evaluation.trial import InputDigests
+from bidnerf.evaluation import InputDigests, ScalarPoseError, Trace, Trial, TrialResult
 
 
 def trial_result(trial: Trial, distances: Sequence[float], angles: Sequence[float] = (), **changes: Any) -> TrialResult:
