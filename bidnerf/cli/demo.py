@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
-from bidnerf.cli.options import Overwrite, Seed, installed
+from bidnerf.cli.options import Overwrite, Seed, installed, wrong_usage
 from bidnerf.cli.output import console, print_table, say, show
 from bidnerf.cli.parser import Option
-from bidnerf.cli.running import interruptible_work
-from bidnerf_core.errors import InputError, UsageError
+from bidnerf.cli.running import interruptible_work, report_time
 from bidnerf_core.registry import USUAL_BACKEND
-from bidnerf_core.settings import WholeNumbers
+from bidnerf_core.settings import EXPERT, WholeNumbers
 
 if TYPE_CHECKING:
     from bidnerf_core.frames import View
@@ -34,7 +32,7 @@ def run_demo(
     out: Annotated[Path, Option("DIR", "folder for the map, the images and the pictures")] = Path("demo-out"),
     frames: Annotated[int, WholeNumbers(1), Option("N", "number of unseen frames to localize")] = 4,
     steps: Annotated[int | None, WholeNumbers(1), Option("N", "training steps", "the backend's quick choice")] = None,
-    seed: Seed = 0,
+    seed: Annotated[Seed, EXPERT] = 0,
     overwrite: Overwrite = False,
 ) -> None:
     """Train a map of a closed-form scene, and localize frames in it.
@@ -55,24 +53,17 @@ def run_demo(
 
     config = quick_config(load_backend(backend))
     if steps is not None:
-        try:
+        with wrong_usage():
             config = from_flat(config, {"steps": steps}, f"backend {backend!r}")
-        except InputError as error:
-            raise UsageError(error) from error
     with output_folder(out, overwrite):
         scene, camera = demo_object(), Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
         radius, background = 3.5, scene.bounds.background
         seen = views(scene, camera, orbit(radius, TRAINING_VIEWS, seed=seed))
         unseen = views(scene, camera, orbit(radius, frames, elevation=(15.0, 50.0), seed=seed + 1))
         write_transforms(out / "data", {"train": seen, "test": unseen}, background)
-        began = time.monotonic(), time.process_time()
         options = TrainOptions(DatasetOptions(background=background), overwrite=True)
-        with interruptible_work():
+        with report_time(f"trained on {len(seen)} images of the closed-form scene, and baked"), interruptible_work():
             stored = train(out / "data", backend, out / "map", config, options=options)
-        wall, used = time.monotonic() - began[0], time.process_time() - began[1]
-        say(
-            f"trained on {len(seen)} images of the closed-form scene, and baked: {wall:.0f} s ({used:.0f} s of CPU time)"
-        )
         say(f"localizing {frames} unseen frames by auto without a start, and by bid from a start nearby")
         auto, bid = Localizer(stored), Localizer(stored, "bid", settings_of("bid", DESCENT))
         trials, rows = list[DemoFrame](), []

@@ -11,14 +11,12 @@ from urllib.parse import quote
 
 from bidnerf.cli.options import (
     TEST_IMAGES,
-    Device,
     FrameNames,
-    Json,
     MethodGroup,
     MethodOptions,
     Names,
     NoDepth,
-    Overwrite,
+    RunOptions,
     SeenImages,
     require_device,
     wrong_usage,
@@ -61,7 +59,7 @@ class TrialOptions:
         Option("N", "number of trials per size; without a start, at most one per frame", "the protocol's"),
     ] = None
     seed: Annotated[
-        int | None, WholeNumbers(0, LARGEST_SEED), Option("N", "seed of every random choice", "the protocol's")
+        int | None, EXPERT, WholeNumbers(0, LARGEST_SEED), Option("N", "seed of every random choice", "the protocol's")
     ] = None
     frame: FrameNames = ()
 
@@ -76,9 +74,8 @@ class TrialOptions:
         except ValueError as error:
             raise UsageError(f"--size is {' '.join(self.size)}", expected="numbers such as 0.5, or 0.2:10") from error
         with wrong_usage():
-            usual = "bid" if find_method(method.method).needs_start else "none"
             return Plan(
-                protocol=self.protocol or usual,
+                protocol=self.protocol or ("bid" if find_method(method.method).needs_start else "none"),
                 sizes=numbers or None,
                 method=method.method,
                 config=method.config,
@@ -110,18 +107,17 @@ class InputOptions:
 
 
 @dataclass(frozen=True)
-class WorkOptions:
+class WorkOptions(RunOptions):
     """What runs the trials."""
 
-    device: Device = "cpu"
     workers: Annotated[
         int | None,
         WholeNumbers(1, 10_000),
         Option("N", "number of single-threaded processes", "one per core; one on a GPU"),
     ] = None
-    dask: Annotated[str | None, Option("ADDRESS", "address of a dask scheduler whose workers run the trials")] = None
-    shards: Annotated[int, WholeNumbers(1), EXPERT, Option("N", "number of parts that the trials are split into")] = 1
-    shard: Annotated[int, WholeNumbers(0), EXPERT, Option("I", "the part to run, from 0")] = 0
+    dask: Annotated[
+        str | None, EXPERT, Option("ADDRESS", "address of a dask scheduler whose workers run the trials")
+    ] = None
 
 
 def run_evaluate(
@@ -134,10 +130,9 @@ def run_evaluate(
     *,
     starts: Starts,
     input: Annotated[InputOptions, Group("input", "What the method receives of each frame.")],
-    work: Annotated[WorkOptions, Group("work", "Where the trials are run.")],
+    work: Annotated[WorkOptions, Group("work", "Where the trials are run."), Without("overwrite")],
     images: SeenImages = TEST_IMAGES,
     method: MethodGroup,
-    json: Json = False,
 ) -> None:
     """Localize many frames of a dataset, and write a JSON line a trial.
 
@@ -158,15 +153,13 @@ def run_evaluate(
         device=work.device,
         depth=not input.no_depth,
         faults=input.fault,
-        shard=work.shard,
-        shards=work.shards,
     )
     require_device(work.device)
     require_outside_maps(out.parent, out)
     with interruptible_work("waiting for the trials under way (Ctrl-C again: at once)"):
         table = evaluate(map, data or map, plan, out=out, workers=work.dask or work.workers)
     text = f"{amount(len(table.rows), 'trial')} in {out}; 'bidnerf report {out}' shows them"
-    print_result([row.plain() for row in table.rows], [text], json)
+    print_result([row.plain() for row in table.rows], [text], work.json)
 
 
 def run_compare(
@@ -189,9 +182,7 @@ def run_compare(
     ] = None,
     *,
     starts: Annotated[Starts, Without("size")],
-    json: Json = False,
-    overwrite: Overwrite = False,
-    device: Device = "cpu",
+    run: RunOptions,
     images: SeenImages = TEST_IMAGES,
     method: MethodGroup,
 ) -> None:
@@ -209,11 +200,11 @@ def run_compare(
     from bidnerf_core.io import output_folder, to_plain
 
     *maps, data = folders
-    require_device(device)
-    plan = replace(starts, size=() if size is None else (size,)).plan(method, images, device=device)
+    require_device(run.device)
+    plan = replace(starts, size=() if size is None else (size,)).plan(method, images, device=run.device)
     if out is not None:
         check_folder(out, folders)
-    with nullcontext() if out is None else output_folder(out, overwrite), display_progress():
+    with nullcontext() if out is None else output_folder(out, run.overwrite), display_progress():
         comparison = compare(maps, data, plan)
         if out is not None:
             comparison.save(out / "compare.json")
@@ -221,7 +212,7 @@ def run_compare(
                 say(f"look at {comparison_figure(out, comparison).with_suffix('.png')}")
             except InputError as error:  # matplotlib is optional
                 say(str(error))
-    print_result(to_plain(replace(comparison, results=())), str(comparison).split("\n"), json)
+    print_result(to_plain(replace(comparison, results=())), str(comparison).split("\n"), run.json)
 
 
 def run_report(
@@ -229,6 +220,7 @@ def run_report(
     out: Annotated[Path, Option("DIR", "folder for index.html and the figures as PNG and SVG")] = Path("report"),
     criterion: Annotated[
         Literal["10%", "5deg", "1deg"] | None,
+        EXPERT,
         Option(
             None,
             "success criterion for displays that use only one: 10% of the start's error, 5 degrees and 0.05 or 1 degree and"

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import math
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +12,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from bidnerf.cli.options import (
     TEST_IMAGES,
-    Device,
-    Json,
     MapFolder,
     MethodGroup,
-    Overwrite,
     Queries,
+    RunOptions,
     Seed,
     SeenImages,
     pose_file_help,
@@ -31,6 +29,7 @@ from bidnerf.cli.parser import Group, Option
 from bidnerf.cli.running import display_progress
 from bidnerf.cli.signals import defer_interruptions
 from bidnerf_core.errors import InputError, UsageError, amount, enumeration, errors_in
+from bidnerf_core.settings import EXPERT
 
 if TYPE_CHECKING:
     from bidnerf.results import Answer, Answers, Failure
@@ -54,11 +53,12 @@ class StartOptions:
             "T R", "start from the dataset's pose moved by T metres and R degrees, each frame in a direction of its own"
         ),
     ] = None
+    seed: Annotated[Seed, EXPERT] = 0
 
     def __post_init__(self) -> None:
         require_one({"--start": self.start, "--perturb": self.perturb})
 
-    def of_queries(self, seed: int) -> Callable[[Query], SE3 | None]:
+    def of_queries(self) -> Callable[[Query], SE3 | None]:
         """Return a function that maps a query to its start pose, or to None if the query has none.
 
         Raises ``UsageError`` if the perturbation is out of range.
@@ -73,27 +73,20 @@ class StartOptions:
                 find_protocol("perturb").check_size(moved)
         poses = None if start is None else read_poses(start)
 
-        numbers = itertools.count(seed)
-        moves: dict[str, SE3 | None] = {}  # by frame, since a drawing asks for the start again
-
         def start_of(query: Query) -> SE3 | None:
             if moved is not None and query.truth is not None:
-                if query.name not in moves:
-                    moves[query.name] = perturb(query.truth, *moved, next(numbers))
-                return moves[query.name]
+                return perturb(query.truth, *moved, self.seed + zlib.crc32(query.name.encode(errors="surrogatepass")))
             return None if poses is None else pose_of(poses, query.name, start or "start")
 
         return start_of
 
 
 @dataclass(frozen=True)
-class AnswerOutput:
-    """Where answers are written."""
+class AnswerOutput(RunOptions):
+    """Where answers are computed, and where they are written."""
 
     out: Annotated[Path | None, Option("POSES", pose_file_help)] = None
     draw: Annotated[Path | None, Option("DIR", "draw each photo next to the map rendered from the pose found")] = None
-    overwrite: Overwrite = False
-    json: Json = False
 
     def check(self, inputs: Sequence[Path]) -> None:
         """Check that the outputs can be written, before any work is done."""
@@ -123,13 +116,11 @@ def run_localize(
         ),
     ],
     *,
-    output: Annotated[AnswerOutput, Group("output", "What is written beside the lines on standard output.")],
+    output: Annotated[AnswerOutput, Group("output", "Where answers are computed, and where they are written.")],
     queries: Queries,
     images: SeenImages = TEST_IMAGES,
     start: Annotated[StartOptions, Group("start", "Where localization starts. By default, it needs no start.")],
     method: MethodGroup,
-    device: Device = "cpu",
-    seed: Seed = 0,
 ) -> None:
     """Find the poses of photos, or of a dataset's frames, in a map.
 
@@ -138,7 +129,7 @@ def run_localize(
     relative poses come from the dataset, and the pose found is that of the last one's camera. Poses are camera to world with
     OpenCV axes (x right, y down, z forward).
     """
-    from bidnerf.results import Answers, localize
+    from bidnerf.results import Answers, localize, pose_format
     from bidnerf_core.localization import (
         Localizer,
         landmark_cameras,
@@ -153,14 +144,14 @@ def run_localize(
         named = enumeration([repr(str(path)) for path in maps])
         expected = "MAP first, then image files, folders of photos, or a folder of a dataset"
         raise UsageError(f"no QUERY after {named};", expected=expected)
-    start_of = start.of_queries(seed)
+    start_of = start.of_queries()
     with wrong_usage():
         require_fit(
             method.method,
             lambda chosen: not chosen.needs_start or start.start is not None or start.perturb is not None,
             "needs a start; give one by --start, or use method",
         )
-    require_device(device)
+    require_device(output.device)
     if start.perturb is not None and not queries.is_dataset(paths):
         raise UsageError("--perturb moves the true pose, which photos do not have;", expected="--start")
     files = (*paths, *queries.depth, start.start, images.camera, images.register_depth)
@@ -168,13 +159,16 @@ def run_localize(
     output.check(inputs)
     opener = queries.opener(paths, images)
     if len(maps) > 1 or maps_in(map) not in ([], [map]):
-        _check_for_several(output, start)
+        given = {"--start": start.start, "--perturb": start.perturb, "--draw": output.draw}
+        refuse(given, "applies to one map, but several are given")
+        if output.out is not None and pose_format(output.out) != ".json":
+            raise UsageError("poses in several maps have different worlds", where=output.out, expected="a .json file")
         with display_progress():
-            collection = MapCollection(maps, method.method, method.config, device=device)
+            collection = MapCollection(maps, method.method, method.config, device=output.device)
         finder: Localizer | MapCollection = collection
         answers, source = Answers(collection), opener(collection.cameras, None)
     else:
-        scene = load_map(map, device)
+        scene = load_map(map, output.device)
         cameras = landmark_cameras(scene) if matches_landmarks(method.method, method.config) else ()
         source = opener(cameras, scene.bounds.background)
         answers = Answers(scene)
@@ -184,7 +178,7 @@ def run_localize(
             check_output(output.picture(name), inputs, output.overwrite)
     shown = Run(output, answers, len(source.names), start_of)
     with display_progress(), shown.save_at_end():
-        localize(finder, source, start=start_of, seed=seed, answers=answers, each=shown.show)
+        localize(finder, source, start=start_of, seed=start.seed, answers=answers, each=shown.show)
 
 
 def _holds_maps(path: Path) -> bool:
@@ -197,20 +191,6 @@ def _holds_maps(path: Path) -> bool:
         return bool(maps)
     images = any(file.suffix.lower() in IMAGE_SUFFIXES for file in path.iterdir())
     return not images and find_reader(path) is None
-
-
-def _check_for_several(output: AnswerOutput, start: StartOptions) -> None:
-    """Raise ``UsageError`` if an option is given that cannot be used with several maps."""
-    from bidnerf.results import pose_format
-
-    given = {
-        "--start": start.start,
-        "--perturb": start.perturb,
-        "--draw": output.draw,
-    }
-    refuse(given, "applies to one map, but several are given")
-    if output.out is not None and pose_format(output.out) != ".json":
-        raise UsageError("poses in several maps have different worlds", where=output.out, expected="a .json file")
 
 
 @dataclass

@@ -19,6 +19,7 @@ from bidnerf.cli.options import (
     MappedImages,
     NewMap,
     Overwrite,
+    RunOptions,
     WholeImages,
     installed,
     refuse,
@@ -167,10 +168,8 @@ def run_render(
     level: Annotated[
         int | None, EXPERT, Option("N", "level of detail, 0 the coarsest", "the field itself, the finest")
     ] = None,
-    overwrite: Overwrite = False,
-    device: Device = "cpu",
-    json: Json = False,
     *,
+    run: RunOptions,
     images: WholeImages = TEST_IMAGES,
 ) -> None:
     """Render a map from the poses of a dataset.
@@ -182,21 +181,19 @@ def run_render(
     from bidnerf_core.maps import load_info, load_map
 
     check_folder(out, (map, data))
-    require_device(device)
-    with output_folder(out, overwrite), display_progress():
+    require_device(run.device)
+    with output_folder(out, run.overwrite), display_progress():
         dataset = replace(images, background=load_info(map).bounds.background).open(data)
-        names = list(frame) or dataset.frame_names(images.split)
-        if not names:
+        views = dataset.views(images.split, list(frame) or None)
+        if not views:
             raise InputError(f"split {images.split!r} has no frames", where=data)
-        scene = load_map(map, device)
-        views = dataset.views(images.split, names)
-        names = [view.frame.name for view in views]
+        scene, names = load_map(map, run.device), [view.frame.name for view in views]
         for name in {f"{name}.depth" for name in names} & set(names):
             raise InputError(
                 f"frame {name!r} would overwrite the depth of {name.removesuffix('.depth')!r}; render them one by one"
                 " with --frame, into different folders"
             )
-        _render_views(scene, level, views, out, json)
+        _render_views(scene, level, views, out, run.json)
 
 
 def _render_views(scene: Map, level: int | None, views: Sequence[View], out: Path, json: bool) -> None:
@@ -372,7 +369,6 @@ def run_import(
         installed("importers"),
         Option("NAME", "one of 'bidnerf plugins importers'", "the one that recognizes the file"),
     ] = None,
-    json: Json = False,
     *,
     world: Annotated[WorldOptions, Group("world", "How the coordinates of the file become those of the map.")],
     photos: Annotated[
@@ -400,12 +396,10 @@ def run_import(
 
     check_folder(out, (file, photos), may_be_map=True)
     require_device(target.device)
-    pose = None
-    if world.T_world_file is not None:
-        pose = read_pose(world.T_world_file)
+    pose = None if world.T_world_file is None else read_pose(world.T_world_file)
     options = ImportOptions(
         images, target.landmark_features, target.device, target.overwrite, importer, world.scale, pose
     )
     with interruptible_work():
         scene = import_map(file, out, config, photos=photos, bake=not target.no_bake, options=options)
-    print_result(scene.describe().plain(), (), json)
+    print_result(scene.describe().plain(), (), target.json)

@@ -85,6 +85,15 @@ def _method_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
 
 
 @dataclass(frozen=True)
+class RunOptions:
+    """Where a command computes, what it prints, and whether it replaces its output."""
+
+    device: Device = "cpu"
+    json: Json = False
+    overwrite: Overwrite = False
+
+
+@dataclass(frozen=True)
 class MethodOptions:
     """How poses are found."""
 
@@ -104,10 +113,9 @@ MethodGroup: TypeAlias = Annotated[MethodOptions, Group("localization", "How pos
 
 
 @dataclass(frozen=True)
-class MapOutput:
+class MapOutput(RunOptions):
     """The map that is written, and its landmarks."""
 
-    overwrite: Overwrite = False
     no_bake: Annotated[bool, FLAG, EXPERT, Option(None, "leave the surface and landmarks to 'bidnerf bake'")] = False
     landmark_features: Annotated[
         str,
@@ -115,7 +123,6 @@ class MapOutput:
         installed("features"),
         Option("NAME", "detector of the landmarks, one of 'bidnerf plugins features'"),
     ] = USUAL_FEATURES
-    device: Device = "cpu"
 
 
 NewMap: TypeAlias = Annotated[MapOutput, Group("map", "How the map is made and written.")]
@@ -187,7 +194,7 @@ PhotoCamera: TypeAlias = Annotated[
 ]
 NewPhotoCamera: TypeAlias = Annotated[
     CameraOptions,
-    Group("camera", "The camera of photos without poses. By default, it is estimated, starting from EXIF."),
+    Group("camera", "The camera of photos without poses. Otherwise, EXIF and the photos give it."),
 ]
 
 
@@ -203,6 +210,7 @@ class QueryOptions:
     rig: Annotated[bool, FLAG, Option(None, "find one pose for the frames in --frame, together as a rig")] = False
     window: Annotated[
         int,
+        EXPERT,
         WholeNumbers(1),
         Option("K", "combine each frame with those before it in the split, K in all, as a rig"),
     ] = 1

@@ -10,6 +10,7 @@ import argparse
 import ast
 import builtins
 import dataclasses
+import difflib
 import functools
 import inspect
 import itertools
@@ -22,11 +23,13 @@ import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
 from bidnerf.cli.program import option_name
 from bidnerf_core.errors import InputError, UsageError, enumeration, spelled, spelling_hint
+from bidnerf_core.registry import list_plugins, registered_names
 from bidnerf_core.settings import Allowed, Expert, OneOf
 
 T = TypeVar("T")
@@ -34,6 +37,8 @@ T = TypeVar("T")
 HELP, HELP_ALL = "--help", "--help-all"
 NEGATIVE = re.compile(r"-[\d.]")
 """Matches the beginning of a value such as -1,0,2, which is not an option."""
+FIELD = re.compile(r"^    (\w+): ", re.MULTILINE)
+"""Matches the name of a field of a dataclass in its source."""
 ESCAPE = "\0"
 """Precedes words that are no options, though they look like one; arguments of a program cannot contain it."""
 MISSING_ARGUMENTS = "the following arguments are required: "  # argparse's words
@@ -157,7 +162,7 @@ def parse(command: str, target: Callable[..., T], arguments: Sequence[str]) -> T
     if pending:
         first = _Parser(command, target, {}, options_only=True)
         given = vars(first.parse_known_args(_escape(words))[0])
-        if not pages and first.unknown_option(words) is None:  # else it may be one of the settings
+        if not pages and not first.may_hold_a_setting(words):
             _Parser(command, target, {}).parse_all(words)  # refuses what is missing before settings are loaded
         values = {p.name: p.default for p, _ in leaves(target, {})} | given
         loaded = {name: note.load(values, words) for name, note in pending.items()}
@@ -299,6 +304,24 @@ class _Parser(argparse.ArgumentParser):
         """Return the first word before ``--`` that looks like an option but is none."""
         names = (word.split("=")[0] for word in itertools.takewhile("--".__ne__, words))
         return next((n for n in names if n.startswith("--") and n not in self._option_string_actions), None)
+
+    def may_hold_a_setting(self, words: Sequence[str]) -> bool:
+        """Return whether the first unknown option is more like a setting of an installed package than like the known options.
+
+        The source of these packages is searched, since importing settings takes seconds. The result is True if a script
+        registered plugins of its own.
+        """
+        groups, packages, fields = ("backends", "methods", "importers"), {"bidnerf_core"}, set[str]()
+        unknown, known = self.unknown_option(words), self._option_string_actions
+        if unknown is None or any(group in groups for group, _ in registered_names()):
+            return unknown is not None
+        packages |= {re.split("[.:]", info.value)[0] for group in groups for info in list_plugins(group)}
+        for spec in filter(None, map(find_spec, packages)):
+            folders = map(Path, spec.submodule_search_locations or ())
+            for file in [Path(spec.origin or ""), *(file for folder in folders for file in folder.rglob("*.py"))]:
+                fields |= {option_name(name) for name in FIELD.findall(file.read_text(encoding="utf-8"))}
+        near = difflib.get_close_matches(re.sub("^--no-", "--", unknown), fields.union(known), n=1, cutoff=0.8)
+        return not fields.difference(known).isdisjoint(near)
 
     def parse_all(self, words: Sequence[str]) -> dict[str, Any]:
         """Parse words, and return the values of the arguments given, by parameter name. Raises ``UsageError``."""

@@ -76,6 +76,15 @@ class Display:
 
 
 @contextlib.contextmanager
+def report_time(what: str) -> Iterator[None]:
+    """Print how long the work in the context took, by a clock and in CPU time, which other processes do not lengthen."""
+    began = time.monotonic(), time.process_time()
+    yield
+    wall, used = time.monotonic() - began[0], time.process_time() - began[1]
+    say(f"{what} in {duration_text(wall)} ({duration_text(used)} of CPU time)")
+
+
+@contextlib.contextmanager
 def display_progress() -> Iterator[None]:
     """Display the progress of the work in the context."""
     display = Display()

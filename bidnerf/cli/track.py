@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from bidnerf.cli.options import (
-    Device,
-    Json,
+    CameraOptions,
     MapFolder,
     NoDepth,
-    Overwrite,
     PhotoCamera,
+    RunOptions,
     SeenImages,
     pose_file_help,
     require_device,
@@ -35,12 +34,13 @@ from bidnerf_core.settings import EXPERT, WholeNumbers
 class FrameOptions:
     """Which frames are tracked, and what they measure."""
 
-    split: Annotated[str | None, Option("NAME", "use only the frames of one split of a dataset", "all")] = None
+    split: Annotated[str | None, EXPERT, Option("NAME", "use only the frames of one split of a dataset", "all")] = None
     every: Annotated[int, WholeNumbers(1), Option("N", "use only every Nth frame")] = 1
     no_depth: NoDepth = False
     depth_sensor: Annotated[
         str, EXPERT, Option("NAME", "what measured the depth: unknown, kinect, realsense, lidar or rendered")
     ] = "unknown"
+    camera: PhotoCamera = CameraOptions()
 
 
 @dataclass(frozen=True)
@@ -74,13 +74,10 @@ def run_track(
     sequence: Annotated[Path, Option("SEQUENCE", "folder of a dataset or images, or a video", positional=True)],
     out: Annotated[Path, Option("TRAJECTORY", pose_file_help)],
     plot: Annotated[Path | None, Option("PNG", "draw the path over the map's surface, coloured by uncertainty")] = None,
-    overwrite: Overwrite = False,
-    json: Json = False,
     *,
+    run: RunOptions,
     frames: Annotated[FrameOptions, Group("frames", "Which frames are tracked, and whether their depth is used.")],
-    camera: PhotoCamera,
     images: Annotated[SeenImages, Without("split")],
-    device: Device = "cpu",
     tracking: Annotated[TrackingOptions, Group("tracking", "How tracking begins, and which poses it accepts.")],
 ) -> None:
     """Find the poses of a sequence's frames in a map, in order of time.
@@ -100,20 +97,20 @@ def run_track(
             raise UsageError(where=plot, expected="a name that ends with .png or .svg")
     named = (sequence, images.camera, tracking.start, images.register_depth)
     for file in filter(None, (out, plot)):
-        check_output(file, [Path(each) for each in named if isinstance(each, str | Path)], overwrite)
-    require_device(device)
+        check_output(file, [Path(each) for each in named if isinstance(each, str | Path)], run.overwrite)
+    require_device(run.device)
     require_inputs(sequence, tracking.start)
     if is_video(sequence):
         import_extra("av", "video", "reading a video", sequence, "; or extract its frames to a folder")
     start = None if tracking.start is None else read_pose(tracking.start)
     with wrong_usage():
         settings = settings_of(USUAL_METHOD, {"depth_sensor": frames.depth_sensor, "risk": tracking.risk})
-    scene = load_map(map, device)
+    scene = load_map(map, run.device)
     path, began = Answers(scene, is_sequence=True, interval=tracking.config.frame_seconds), time.perf_counter()
     localizer = Localizer(scene, config=settings)
     try:
         with display_progress():
-            source = camera.source(images.camera, localizer.assumed_cameras)
+            source = frames.camera.source(images.camera, localizer.assumed_cameras)
             recorded = replace(images, camera=source, background=scene.bounds.background).open_sequence(sequence)
             recorded = recorded if frames.split is None else recorded.split(frames.split)
             tracker = Tracker(localizer, tracking.config, start)
@@ -126,7 +123,7 @@ def run_track(
                 finally:
                     if plot is not None:
                         path.plot(plot, scene.surface, scene.up)
-                if json:
+                if run.json:
                     for answer in path.given:
                         print_json(path.plain(answer))
                 else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +24,7 @@ from bidnerf.cli.options import (
 )
 from bidnerf.cli.output import check_folder, print_result
 from bidnerf.cli.parser import Flag, Group, Option, SettingsGroup
-from bidnerf.cli.running import interruptible_work
+from bidnerf.cli.running import interruptible_work, report_time
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.registry import USUAL_BACKEND, USUAL_FEATURES, USUAL_POSER
@@ -81,23 +82,14 @@ def _given_camera(camera: Any, options: CameraOptions) -> Any:
 def _backend_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
     """Return the default settings of the named backend, or of the backend of the map to resume."""
     from bidnerf_core.backend import load_backend, quick_config
-
-    name, out = values["backend"], values["out"]
-    resumed = _resumed(out) if (values["resume"] or values["finish"]) and name is None else None
-    if resumed is not None and resumed.backend:
-        return load_backend(resumed.backend, str(out)).config_type()
-    backend = load_backend(name or USUAL_BACKEND)
-    return quick_config(backend) if values["quick"] else backend.config_type()
-
-
-def _resumed(out: Any) -> MapInfo | None:
-    """Return the description of the map to resume, or None if none can be read, which is reported later."""
     from bidnerf_core.maps import load_info
 
-    try:
-        return load_info(out) if isinstance(out, Path) else None
-    except InputError:
-        return None
+    name, out, where = values["backend"], values["out"], ""
+    if (values["resume"] or values["finish"]) and name is None and isinstance(out, Path):
+        with contextlib.suppress(InputError):  # which is reported later
+            name, where = load_info(out).backend, str(out)
+    backend = load_backend(name or USUAL_BACKEND, where)
+    return quick_config(backend) if values["quick"] else backend.config_type()
 
 
 @dataclass(frozen=True)
@@ -135,6 +127,7 @@ class PoseOptions:
     trust_poses: Annotated[
         Flag, EXPERT, Option(None, "train even if the given poses contradict most pairs of photos")
     ] = False
+    camera: NewPhotoCamera = CameraOptions()
 
 
 @dataclass(frozen=True)
@@ -143,6 +136,7 @@ class DepthPointsOptions:
 
     depth_points: Annotated[
         Path | None,
+        EXPERT,
         Option("MODEL", "COLMAP sparse model whose points provide depth for images without any"),
     ] = None
     model_points: PointChoice = None
@@ -153,12 +147,10 @@ def run_train(
         Path, Option("DATA", "folder of a dataset or of photos without poses, or a video", positional=True)
     ],
     out: Annotated[Path, Option("MAP", "folder for the map")],
-    json: Json = False,
     *,
     training: Annotated[TrainingOptions, Group("training", "Which field is trained, and how long.")],
     target: NewMap,
     given_poses: Annotated[PoseOptions, Group("poses", "What happens to the poses of the dataset.")],
-    photos_camera: NewPhotoCamera,
     sparse_depth: Annotated[DepthPointsOptions, Group("sparse depth", "Depth for images that have none.")],
     images: ImageOptions,
     config: Annotated[
@@ -195,7 +187,7 @@ def run_train(
             background_colour(images.background)
     check_folder(out, (data,), may_be_map=True)
     require_device(target.device)
-    images = replace(images, camera=_given_camera(images.camera, photos_camera))
+    images = replace(images, camera=_given_camera(images.camera, given_poses.camera))
     photos = lacks_poses(data, images)
     if photos:
         given = {"--depth-unit": images.depth_unit, "--register-depth": images.register_depth, "--masks": images.masks}
@@ -217,7 +209,7 @@ def run_train(
         sparse_depth.model_points,
         training.checkpoint_every,
     )
-    with interruptible_work():
+    with report_time(f"{out}: trained and baked" if bake else f"{out}: trained"), interruptible_work():
         if resumes:
             try:
                 scene = resume(out, data, bake=bake, finish=training.finish, options=options)
@@ -225,7 +217,7 @@ def run_train(
                 raise UsageError(error) from error
         else:
             scene = train(data, training.backend or USUAL_BACKEND, out, config, bake=bake, options=options)
-    print_result(scene.describe().plain(), (), json)
+    print_result(scene.describe().plain(), (), target.json)
 
 
 def _interrupted(

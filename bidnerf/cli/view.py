@@ -27,6 +27,7 @@ from bidnerf.cli.running import display_progress
 from bidnerf.service import LEAST_TOKEN, ServiceLimits
 from bidnerf.service import serve as serve_maps
 from bidnerf_core.errors import InputError, UsageError
+from bidnerf_core.installation import import_extra
 from bidnerf_core.io import read_file
 from bidnerf_core.progress import counter
 from bidnerf_core.registry import USUAL_METHOD
@@ -184,6 +185,7 @@ def run_serve(
     /docs describes all paths, as does /openapi.json, and /health and /metrics are for monitoring. Each request is logged as a line of
     JSON on stderr.
     """
+    import_extra("uvicorn", "serve", "the service")
     require_device(device)
     stated = os.environ.get(TOKEN)
     if token_file is not None:

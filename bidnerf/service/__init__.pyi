@@ -8,7 +8,6 @@ from .protocols import SERVICES as SERVICES
 from .protocols import ServiceProtocol as ServiceProtocol
 from .queue import RequestQueue as RequestQueue
 from .queue import ThreadExecutor as ThreadExecutor
-from .server import NEEDS as NEEDS
 from .server import PORT as PORT
 from .server import choose_token as choose_token
 from .server import run_app as run_app

@@ -46,7 +46,7 @@ class DatasetOptions:
     """file with the intrinsics of the depth camera and T_colour_depth (4x4), from which depth is registered to colour images;
     'no' if depth is already registered"""
 
-    depth_unit: Annotated[float | None, "METRES"] = None
+    depth_unit: Annotated[float | None, EXPERT, "METRES"] = None
     """metres per step of the depth images, such as 0.001 for millimetres"""
 
     masks: Annotated[str | Path | MaskFolder | None, "DIR"] = None

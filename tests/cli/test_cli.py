@@ -34,7 +34,6 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import Localizer
 from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.maps import Checkpoints, MapInfo, load_info, load_map
-from bidnerf_core.registry import list_plugins
 from bidnerf_core.training import TrainingStep
 from commands import Run, assert_refused, quietly, strict
 from trainings import assert_same_map, stop_at
@@ -152,26 +151,6 @@ def test_values_that_are_no_depth_are_mentioned_once(bidnerf: Run, shared: Path,
     outcome = bidnerf("render", shared / "map", data, "--out", tmp_path / "out")
     assert (outcome.status, outcome.err.count("\n")) == (0, 1)
     assert f"{data}/depth/t_0000.png: depth: treated as not measured: 3 x 65535" in outcome.err
-
-
-def test_names_that_do_not_exist_are_told_with_those_that_do(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
-    data, place, out = shared / "data", shared / "map", ["--out", tmp_path / "out"]
-    known = ", ".join(sorted(info.name for info in list_plugins("backends")))
-    train, localize, render = ["train", data, *out], ["localize", place, data], ["render", place, data, *out]
-    cases: list[tuple[list[Any], int, tuple[Any, ...]]] = [
-        ([*train, "--backend", "hashgird"], 2, ("'hashgird'", "mean 'hashgrid'")),
-        (["demo", *out, "--backend", "x"], 2, ("'x'", known)),
-        ([*train, "--split", "trian"], 1, (data, "'trian'", "train, test")),
-        ([*train, "--background", "pink"], 2, ("'pink'", '"white"')),
-        ([*localize, *QUICK, "--frame", "t_001"], 1, (data, "'t_001'", "mean 't_0001'")),
-        ([*localize, "--frame", "t_0001", "--method", "x"], 2, ("'x'",)),
-        ([*render, "--frame", "r_0000"], 1, (data, "'test'", "'r_0000'")),
-        ([*render, "--level", "2"], 1, (place, "level 2", "0 to 1")),
-        ([*render, "--level", "-1"], 1, (place, "level -1", "0 to 1")),
-    ]
-    for words, status, named in cases:
-        assert_refused(bidnerf(*words), status, *named)
-    assert list(tmp_path.iterdir()) == []
 
 
 # Maps that cannot be used.
@@ -415,14 +394,6 @@ def test_a_start_that_is_no_pose_is_told_in_a_line(case: str, bidnerf: Run, shar
     assert_refused(found, 1, path, fault, "expected")
 
 
-def test_a_perturbation_is_judged(bidnerf: Run, shared: Path) -> None:
-    place = ["localize", shared / "map", shared / "data", "--frame", "t_0000", "--perturb"]
-    for wrong in ("nan", "inf"):
-        assert_refused(bidnerf(*place, wrong, "5"), 2, f"--perturb is '{wrong}'", "a number")
-    for wrong in (("-1", "5"), ("0.5", "1e9"), ("0.5", "180.1"), ("0.5", "-1")):
-        assert_refused(bidnerf(*place, *wrong), 2, "--perturb: size is", "0 to 1e+06 : 180")
-
-
 # What is printed.
 
 
@@ -462,8 +433,6 @@ def test_each_frame_of_a_rig_counts_once(bidnerf: Run, shared: Path, photos_only
     place = ["localize", shared / "map", photos_only, *QUICK]
     several = bidnerf(*place, "--rig", "--frame", "t_0000", "t_0001", "--frame", "t_0002")
     assert (several.status, several.err) == (0, "t_0000, t_0001, t_0002: no measured depth; colour only\n")
-    for twice in (["t_0001", "t_0001"], ["t_0000", "t_0001", "--frame", "t_0001"]):
-        assert_refused(bidnerf(*place, "--frame", *twice), 2, "--frame", "t_0001")
 
 
 def test_a_window_is_the_frame_and_those_before_it(bidnerf: Run, shared: Path, photos_only: Path) -> None:
@@ -477,13 +446,6 @@ def test_a_window_is_the_frame_and_those_before_it(bidnerf: Run, shared: Path, p
         assert found.err.endswith(f"{taken}: no measured depth; colour only\n")
         cut = "--window 3: t_0001 has only 1 before it" in found.err
         assert cut == (size == 3)
-    for words, status, named in (
-        (["t_0000", "t_0001", "--rig", "--window", 2], 2, ("--rig", "--window")),
-        (["t_0000", "--window", 0], 2, ("--window is 0",)),
-        (["t_0000", "--window", 4], 1, ("--window is 4", "1 to 3")),
-        (["t_9", "--window", 2], 1, ("'t_9'",)),
-    ):
-        assert_refused(bidnerf(*place, "--frame", *words), status, *named)
 
 
 def test_localize_without_json_prints_to_stdout_too(bidnerf: Run, shared: Path) -> None:
@@ -500,12 +462,6 @@ def test_an_answer_that_is_not_finite_is_no_answer(bidnerf: Run, shared: Path, m
     )
     found = bidnerf("localize", shared / "map", shared / "data", "--frame", "t_0001", *QUICK, "--json")
     assert_refused(found, 1, "t_0001", "not finite")
-
-
-def test_no_start_is_refused_by_methods_and_maps_that_need_one(bidnerf: Run, shared: Path) -> None:
-    place = ["localize", shared / "map", shared / "data", "--frame", "t_0000"]
-    assert_refused(bidnerf(*place, "--method", "bid"), 2, "'bid' needs a start", "--start", "'auto'")
-    assert_refused(bidnerf(*place), 1, "needs a start", "'bidnerf bake'")
 
 
 def test_backends_are_listed(bidnerf: Run, monkeypatch: pytest.MonkeyPatch) -> None:

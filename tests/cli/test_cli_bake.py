@@ -176,22 +176,6 @@ def test_training_bakes_unless_told_otherwise(
     assert load_map(tmp_path / "empty").info.complete
 
 
-@pytest.mark.parametrize(
-    ("line", "status", "named"),
-    [
-        ("{none}", 1, "no such folder"),
-        ("{map} --cells 3", 2, "cells is 3"),
-        ("{map} --data {none}", 1, "none"),
-        ("{map} --split x --data {data}", 1, "no split 'x'"),
-        ("{map} --frobnicate", 2, "--frobnicate"),
-        ("{map} --rendered-landmarks --data {data}", 2, "--rendered-landmarks"),
-    ],
-)
-def test_mistakes_are_told(line: str, status: int, named: str, shared: Path, tmp_path: Path, bidnerf: Run) -> None:
-    places = {"none": tmp_path / "none", "map": shared / "map", "data": shared / "data"}
-    assert_refused(bidnerf("bake", *(word.format(**places) for word in line.split())), status, named)
-
-
 # Landmarks.
 
 

@@ -125,27 +125,7 @@ def test_a_broken_photo_does_not_stop_the_others(bidnerf: Run, given: Path, plac
     assert json.loads((tmp_path / "poses.json").read_text()) == [good, bad, last]
 
 
-def test_what_is_no_query_is_refused_in_a_line(
-    bidnerf: Run, shared: Path, given: Path, place: list[Any], tmp_path: Path
-) -> None:
-    (tmp_path / "empty").mkdir()
-    photos, data, known = given / "photos", shared / "data", shared / "map"
-    other = shutil.copytree(known, tmp_path / "other")
-    assert_refused(bidnerf(*place, photos / "t_0001.png"), 1, "no focal length in EXIF")
-    assert_refused(bidnerf(*place, tmp_path / "empty"), 1, tmp_path / "empty", "empty")
-    assert_refused(bidnerf("localize", photos, known), 2, f"'{photos}'", f"'{known}'", "MAP first")
-    assert_refused(bidnerf("localize", known, other), 2, f"'{known}' and '{other}'", "QUERY")
-    assert_refused(bidnerf(*place, data / "transforms.json"), 1, data / "transforms.json", f"folder, {data}")
-
-
 # Datasets.
-
-
-@pytest.mark.parametrize("command", ["localize", "view", "evaluate"])
-def test_a_frame_of_another_split_is_told_where_it_is(bidnerf: Run, shared: Path, tmp_path: Path, command: str) -> None:
-    out = {"view": ["--save", tmp_path / "page.html"], "evaluate": ["--out", tmp_path / "r.jsonl"]}
-    words = [command, shared / "map", shared / "data", "--frame", "r_0000", *out.get(command, [])]
-    assert_refused(bidnerf(*words), 1, "no frame 'r_0000'", "split 'train'", after_remarks=True)
 
 
 def test_each_frame_of_a_split_or_of_all_is_a_query(bidnerf: Run, shared: Path, place: list[Any]) -> None:
@@ -161,14 +141,15 @@ def test_each_frame_of_a_split_or_of_all_is_a_query(bidnerf: Run, shared: Path, 
 
 def test_each_frame_is_moved_in_a_direction_of_its_own() -> None:
     view = unseen()
-    start_of = StartOptions(perturb=(0.1, 5.0)).of_queries(seed=3)
+    start_of = StartOptions(perturb=(0.1, 5.0), seed=3).of_queries()
     first, second, again = (start_of(Query(name, (view,), view.T_ref_camera)) for name in ("a", "b", "a"))
     assert isinstance(first, SE3)
     assert isinstance(second, SE3)
     for start in (first, second):
         error = pose_error(start, view.T_ref_camera)
         assert (float(error.translation), float(error.rotation_deg)) == pytest.approx((0.1, 5.0))
-    assert first is again
+    assert isinstance(again, SE3)
+    assert torch.equal(first.matrix(), again.matrix())
     assert float((first.translation - second.translation).norm()) > 0.01
 
 

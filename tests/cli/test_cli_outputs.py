@@ -342,46 +342,14 @@ def test_what_a_format_or_a_page_needs_is_checked_before_a_map_is_loaded(
     found = bidnerf("export", shared / "map", "--to", "mesh.new", "--out", tmp_path / "out")
     assert_refused(found, 1, shared / "map", "no surface", "'bidnerf bake'")
     assert not (tmp_path / "out").exists()
-    monkeypatch.setitem(sys.modules, "fastapi", None)  # as where the extra is not installed
-    for module in ("bidnerf.service.web", "bidnerf.viewer.app"):
-        monkeypatch.delitem(sys.modules, module, raising=False)
+    monkeypatch.setitem(sys.modules, "uvicorn", None)  # as where the extra is not installed
     assert_refused(bidnerf("view", shared / "map"), 1, "pip install 'bidnerf[viewer]'", "--save")
+    assert_refused(bidnerf("serve", shared / "map", "--device", "cudaa"), 1, "pip install 'bidnerf[serve]'")
 
 
 def test_new_files_beside_inputs_are_outputs(files: Path) -> None:
     for name in ("poses.json", "data/poses.json", "start.json"):
         check_output(files / name, (files / "photo.png", files / "data", files / "missing"), overwrite=True)
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "localize MAP photo.png --out map/map.json",
-        "localize MAP photo.png --start start.json --out start.json",
-        "localize MAP photo.png --draw map",
-        "localize MAP photo.png --draw map/drawn",
-        "localize MAP overlay-photo.png photo.png --draw .",
-        "track MAP data --out map/map.json",
-        "track MAP data --out poses.txt --plot data/images/a.png",
-        "track MAP data --out poses.txt --plot poses.doc",
-        "evaluate demo:blobs --out map/results.jsonl --trials 1",
-        "render map data --out data --overwrite",
-        "compare map data --out data --overwrite",
-        "train data --out data --overwrite",
-        "train data --out map/inner",
-    ],
-)
-def test_commands_refuse_outputs_that_replace_what_they_read(
-    bidnerf: Run, files: Path, monkeypatch: pytest.MonkeyPatch, line: str
-) -> None:
-    (files / "overlay-photo.png").write_text("kept")
-    monkeypatch.chdir(files)
-    before = sorted(str(file) for file in files.rglob("*"))
-    found = bidnerf(*line.split())
-    assert found.status in (1, 2)
-    assert_refused(found, found.status)
-    assert sorted(str(file) for file in files.rglob("*")) == before
-    assert {file.read_text() for file in files.rglob("*.*") if file.is_file()} == {"kept"}
 
 
 @pytest.mark.parametrize("errors", ["strict", "surrogateescape"])

@@ -142,28 +142,3 @@ def test_a_dataset_of_poses_can_be_read_again(bidnerf: Run, data: Path) -> None:
     assert len(json.loads(out.read_text())["frames"]) == 3
     out.unlink()
     assert len(open_dataset(data).frame_names("test")) == FRAMES
-
-
-@pytest.mark.parametrize(
-    ("line", "status", "named"),
-    [
-        ("{data} --out path.doc", 2, "path.doc"),
-        ("{data} --out nowhere/path.txt", 1, "no folder nowhere"),
-        ("{data}", 2, "--out"),
-        ("{data} --out path.txt --every 0", 2, "--every is 0"),
-        ("{data} --out path.txt --points 0", 2, "points"),
-    ],
-)
-def test_wrong_options_are_refused_before_any_work(
-    line: str,
-    status: int,
-    named: str,
-    bidnerf: Run,
-    data: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    found = bidnerf("track", "MAP", *line.format(data=data).split())
-    assert_refused(found, status, named)
-    assert list(tmp_path.iterdir()) == []

@@ -60,6 +60,8 @@ def test_the_table_is_complete() -> None:
         "localize MAP",
         "localize MAP q.png --method guess",
         "localize MAP q.png --hfov 200",
+        "localize MAP q.png --nope",
+        "train DATA --out MAP --outt X",
         "train DATA --out MAP --backend guess",
         "export MAP --to guess --out DIR",
         "evaluate MAP DATA --out R.jsonl --protocol guess",

@@ -203,7 +203,7 @@ COMMANDS: list[list[str]] = [
     ["demo", "--out", "{}/new", "--frames", "0"],
 ]
 OPTIONS = """
---out --seed --split --frame --size --trials --workers --shards --shard --images --angle --fault --device --protocol --method
+--out --seed --split --frame --size --trials --workers --images --angle --fault --device --protocol --method
 --steps --levels --log2-table-size --width --learning-rate --cells --rays --max-steps --hypotheses --start --perturb --window
 --depth --depth-unit --depth-points --camera --focal --hfov --draw --json --level --overwrite --resume --background --backend
 --dask --criterion --title --no-depth --split= --plot --help --help-all --nothing

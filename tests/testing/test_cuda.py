@@ -16,7 +16,7 @@ import tiny
 from bidnerf import Localization, Localizer
 from bidnerf.cli import main
 from bidnerf.testing import SCENE_BOUNDS as BOUNDS
-from bidnerf.testing import rgbd_views, textured_map, unseen
+from bidnerf.testing import Recorder, rgbd_views, textured_map, unseen
 from bidnerf_core import devices
 from bidnerf_core.backend import load_backend, quick_config
 from bidnerf_core.devices import capture_graph, constant
@@ -24,7 +24,7 @@ from bidnerf_core.fields import FieldValues, SceneBounds, device_of, levels, ren
 from bidnerf_core.geometry import perturb
 from bidnerf_core.localization import settings_of
 from bidnerf_core.maps import load_map
-from bidnerf_core.training import Silent, TrainingState, TrainingStep, TrainingStopped
+from bidnerf_core.training import TrainingStopped
 from optional import require
 from problems import FieldMap
 
@@ -57,17 +57,22 @@ def descent(field: Any, bounds: SceneBounds, method: str = "bid", steps: int = 5
     return localizer(view.frame, perturb(view.T_ref_camera, 0.1, 3.0, seed=0)).poses.matrix()
 
 
+def noting(captured: list[bool]) -> Any:
+    """Return a ``capture_graph`` that notes whether each step could be captured."""
+
+    def noted(step: Any, *rest: Any, **more: Any) -> Any:
+        replay = capture_graph(step, *rest, **more)
+        captured.append(replay is not step)
+        return replay
+
+    return noted
+
+
 @pytest.fixture
 def captures(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     """Whether each step that was to be captured could be."""
     found: list[bool] = []
-
-    def noted(step: Any, *rest: Any) -> Any:
-        replay = capture_graph(step, *rest)
-        found.append(replay is not step)
-        return replay
-
-    monkeypatch.setattr("bidnerf_bid.adam.capture_graph", noted)
+    monkeypatch.setattr("bidnerf_bid.adam.capture_graph", noting(found))
     return found
 
 
@@ -121,13 +126,7 @@ def test_queries_have_the_answers_of_the_cpu_and_replay_graphs(monkeypatch: pyte
     here, replayed = textured_map(surface=True), list[bool]()
     scene = replace(here, field=module_fields.AsModule(here.field))
     frames = [unseen().frame, unseen().frame.replace(depth=None)]
-
-    def noted(step: Any, *rest: Any, **more: Any) -> Any:
-        replay = capture_graph(step, *rest, **more)
-        replayed.append(replay is not step)
-        return replay
-
-    monkeypatch.setattr("bidnerf_core.devices.capture_graph", noted)
+    monkeypatch.setattr("bidnerf_core.devices.capture_graph", noting(replayed))
     expected, there = [Localizer(scene)(frame) for frame in frames], Localizer(scene, device="cuda")
     for _ in range(3):
         found = [there(frame) for frame in frames]
@@ -141,42 +140,6 @@ def test_queries_have_the_answers_of_the_cpu_and_replay_graphs(monkeypatch: pyte
     assert all(replayed)
 
 
-class LossRecorder(Silent):
-    """A report that keeps the losses."""
-
-    def __init__(self) -> None:
-        self.losses: list[float] = []
-
-    def step(self, progress: TrainingStep) -> None:
-        self.losses.append(progress.loss)
-
-
-class Continued(LossRecorder):
-    """A report that begins with the state of another training."""
-
-    def __init__(self, begin: TrainingState | None) -> None:
-        super().__init__()
-        self.begin = begin
-
-    def resume(self) -> TrainingState | None:
-        return self.begin
-
-
-class Interrupted(Silent):
-    """A report that stops a training at a step and keeps its state."""
-
-    def __init__(self, stop: int) -> None:
-        self.stop, self.stopping = stop, False
-        self.saved: TrainingState | None = None
-
-    def step(self, progress: TrainingStep) -> None:
-        self.stopping = progress.step == self.stop
-
-    def save(self, state: TrainingState) -> None:
-        parts = ({name: value.clone() for name, value in part.items()} for part in (state.field, state.optimizer))
-        self.saved = TrainingState(state.step, *parts)
-
-
 @pytest.mark.parametrize("name", BUNDLED)
 def test_training_on_a_gpu_replays_its_steps_and_learns_what_it_learns_on_a_cpu(
     name: str, monkeypatch: pytest.MonkeyPatch
@@ -184,21 +147,16 @@ def test_training_on_a_gpu_replays_its_steps_and_learns_what_it_learns_on_a_cpu(
     backend, losses, replayed = load_backend(name), [], list[bool]()
     config = replace(quick_config(backend), steps=60)
 
-    def noted(step: Any, *rest: Any) -> Any:
-        replay = capture_graph(step, *rest)
-        replayed.append(replay is not step)
-        return replay
-
     def launched(step: Any, *_: Any) -> Any:
         return step
 
-    for device, capture in (("cpu", launched), ("cuda", launched), ("cuda", noted)):
+    for device, capture in (("cpu", launched), ("cuda", launched), ("cuda", noting(replayed))):
         monkeypatch.setattr("bidnerf_core.training.loop.capture_graph", capture)
         torch.manual_seed(0)
         field: Any = backend.build(config, BOUNDS)
-        report = LossRecorder()
+        report = Recorder()
         backend.train(field.to(device), rgbd_views(), config, report)
-        losses.append(torch.tensor(report.losses))
+        losses.append(torch.tensor([step.loss for step in report.steps]))
     assert replayed
     assert all(replayed)
     on_cpu, one_by_one, as_graphs = losses
@@ -210,15 +168,15 @@ def test_a_training_goes_on_on_another_device() -> None:
     """Its random numbers are others, as those of a CPU are not those of a GPU."""
     backend = load_backend("hashgrid")
     config, views = replace(quick_config(backend), steps=48), rgbd_views()
-    half, losses = Interrupted(stop=24), []
+    half, losses = Recorder(stop=24), []
     with pytest.raises(TrainingStopped):
         backend.train(backend.build(config, BOUNDS), views, config, half)  # on the CPU
     for device in ("cpu", "cuda"):
         field: Any = backend.build(config, BOUNDS)
-        rest = Continued(half.saved)
+        rest = Recorder(state=half.saved[0])
         backend.train(field.to(device), views, config, rest)
-        assert len(rest.losses) == 24
-        losses.append(sum(rest.losses) / 24)
+        assert len(rest.steps) == 24
+        losses.append(sum(step.loss for step in rest.steps) / 24)
     assert losses[1] == pytest.approx(losses[0], rel=0.2)
 
 
