@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
+import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +18,7 @@ from typing import Any, TypeVar, cast
 import torch
 from jaxtyping import Shaped
 from torch import Generator, Tensor, nn
+from torch.utils._pytree import tree_leaves
 
 from bidnerf_core.errors import InputError
 
@@ -166,6 +168,8 @@ def run_on(device: torch.device, function: Callable[..., T], *values: Any) -> T:
             free.remove(lane)
     try:
         if key not in lane.remotes:
+            for old in list(filter(_is_orphaned, lane.remotes)):
+                del lane.remotes[old]
             lane.remotes[key] = _Remote(function, values, tensors, lane)
         lane.remotes.move_to_end(key)
         while len(lane.remotes) > 128:  # functions of different shapes; the least recently used is discarded
@@ -204,14 +208,13 @@ class _Remote:
             self._arguments.append(argument)
             first += size
 
-        # The structure of the values with empty tensors, so that the original tensors are not kept alive.
-        template = _rebuild(values, (torch.empty(0) for _ in tensors))
+        template = _outline(values)
 
         def step() -> None:
-            self._result = function(*_rebuild(template, iter(self._arguments)))
+            result = function(*_rebuild(template, iter(self._arguments)))
             parts: list[Tensor] = []
-            _structure(self._result, parts)
-            self._parts = parts
+            _structure(result, parts)
+            self._result, self._parts = _outline(result), parts
             self._bytes = torch.cat([part.reshape(-1).view(torch.uint8) for part in parts])
 
         self._step: Callable[[], None] = step
@@ -242,7 +245,7 @@ def _structure(value: Any, tensors: list[Tensor]) -> Hashable:
         tensors.append(value)
         return value.shape, value.dtype, value.device
     if isinstance(value, nn.Module | Resident):
-        return value
+        return weakref.ref(value)  # whose hash and equality are those of the value, which exists during the call
     if is_dataclass(value) and not isinstance(value, type):
         parts = (vars(value)[part.name] for part in fields(value) if part.name in vars(value))
         return type(value), *(_structure(part, tensors) for part in parts)
@@ -253,9 +256,21 @@ def _structure(value: Any, tensors: list[Tensor]) -> Hashable:
     return cast(Hashable, value)
 
 
+def _outline(value: Any) -> Any:
+    """Return ``value`` with empty tensors and with weak references to fields and surfaces, so that no part of a map is kept alive."""
+    return _map_parts(
+        value, lambda part: torch.empty(0) if isinstance(part, Tensor) else weakref.ref(part), (nn.Module, Resident)
+    )
+
+
+def _is_orphaned(key: Hashable) -> bool:
+    """Return whether a key of ``_structure`` refers to a field or a surface that no longer exists."""
+    return any(isinstance(part, weakref.ref) and part() is None for part in tree_leaves(key))
+
+
 def _rebuild(value: Any, tensors: Iterator[Tensor]) -> Any:
-    """Return ``value`` with its tensors replaced, in order, by the next ones from ``tensors``."""
-    return _map_parts(value, lambda part: next(tensors) if isinstance(part, Tensor) else part, (nn.Module, Resident))
+    """Return the value of an outline, whose tensors are, in order, the next ones from ``tensors``."""
+    return _map_parts(value, lambda part: next(tensors) if isinstance(part, Tensor) else part(), (weakref.ref,))
 
 
 # Moving objects that hold tensors to a device.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import gc
+import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
@@ -151,6 +153,16 @@ def test_functions_run_elsewhere_with_one_copy_there_and_one_back() -> None:
         assert torch.equal(ours[0], theirs[0])
         assert all(map(torch.equal, ours[1].given, theirs[1].given))
         assert (ours[1].module, ours[2]) == (NESTED.module, True)
+
+
+def test_what_is_remembered_of_a_call_keeps_no_field_or_surface_alive() -> None:
+    with Elsewhere():
+        given, table = replace(NESTED, module=nn.Linear(2, 2)), move_to(Table(torch.ones(2)), DEVICE)
+        parts = [weakref.ref(given.module), weakref.ref(table)]
+        run_on(DEVICE, looked_up, given, table, torch.tensor([1]).int(), 0.5)
+        del given, table
+        gc.collect()
+        assert [part() for part in parts] == [None, None]
 
 
 def test_neither_a_capture_nor_a_call_may_wait(monkeypatch: pytest.MonkeyPatch) -> None:
