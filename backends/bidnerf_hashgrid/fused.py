@@ -20,7 +20,8 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 
 from bidnerf_core.devices import constant
-from bidnerf_core.fields import EVEN_SHARE, LARGEST_THICKNESS, TAIL, Rays, RaySamples, SceneBounds
+from bidnerf_core.fields import Rays, RaySamples, SceneBounds
+from bidnerf_hashgrid.concentration import EVEN_SHARE, LARGEST_THICKNESS, TAIL
 from bidnerf_hashgrid.levels import Level
 
 MOST = 96

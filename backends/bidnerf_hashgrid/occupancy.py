@@ -12,7 +12,6 @@ from torch.nn.functional import pad
 
 from bidnerf_core.devices import may_wait
 from bidnerf_core.fields import (
-    Concentrated,
     FieldValues,
     Rays,
     RaySamples,
@@ -21,6 +20,7 @@ from bidnerf_core.fields import (
     VoxelGrid,
 )
 from bidnerf_hashgrid import fused
+from bidnerf_hashgrid.concentration import Concentrated
 from bidnerf_hashgrid.fused import MOST
 
 BLOCK = 8
@@ -162,7 +162,7 @@ class OccupancyGrid(nn.Module):
         start = starts.view(-1).index_select(0, ray * count + block)
         steps = torch.arange(BLOCK, dtype=near.dtype, device=near.device) * self.step
         coordinate = start[:, None] + steps + (offset.index_select(0, ray) * self.step)[:, None]
-        positions = _at(rays, spacing.rows(ray).distance(coordinate), ray)
+        positions = _at(rays, RaySpacing(spacing.exit.index_select(0, ray), spacing.radius).distance(coordinate), ray)
         occupied = self._occupied_at(positions) & (coordinate < far.index_select(0, ray)[:, None])
         block, step = occupied.nonzero(as_tuple=True)
         coordinate = coordinate.view(-1).index_select(0, block * BLOCK + step)

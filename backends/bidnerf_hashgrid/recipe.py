@@ -18,12 +18,12 @@ from bidnerf_core.devices import may_wait
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import (
     FieldValues,
+    RadianceField,
     Rays,
     RaySamples,
     SceneBounds,
     device_of,
     points_of,
-    query_packed,
     query_samples,
     render_values,
     rendering_weights,
@@ -213,3 +213,26 @@ def _visible(
     )
     seen = torch.zeros_like(valid).index_fill(0, index, True).view_as(samples.valid)
     return values, replace(samples, valid=seen), density
+
+
+def query_packed(field: RadianceField, rays: Rays, samples: RaySamples, room: int) -> tuple[FieldValues, RaySamples]:
+    """Return the field's values at the first ``room`` valid samples (r s), and the samples with only these left valid.
+
+    The field is always queried at ``room`` points, so that the host need not wait for the number of valid samples.
+    """
+    valid = samples.valid.reshape(-1)
+    total, room = valid.numel(), min(room, valid.numel())
+    order = valid.cumsum(0)
+    selected = valid & (order <= room)
+    slot = torch.arange(room, device=valid.device)
+    # An empty slot takes some sample of its own, since many gradients for the same point would be added one
+    # after another.
+    index = torch.cat([slot, slot[:1]]).index_copy(
+        0, torch.where(selected, order - 1, room), torch.arange(total, device=valid.device)
+    )[:room]
+    output = field.query(*points_of(rays, samples, index))
+    target = torch.where(slot < order[-1:], index, total)
+    density = output.density.new_zeros(total + 1).index_copy(0, target, output.density)[:-1]
+    rgb = output.rgb.new_zeros((total + 1, 3)).index_copy(0, target, output.rgb)[:-1]
+    values = FieldValues(density.view_as(samples.valid), rgb.view(*samples.valid.shape, 3))
+    return values, replace(samples, valid=selected.view_as(samples.valid))

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
+import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
 from bidnerf_core.fields import (
     FieldValues,
     HierarchicalField,
     Importance,
     OccupancyMask,
-    OccupiedOnly,
+    Rays,
     RaySampler,
+    RaySamples,
     SceneBounds,
     Stratified,
     VoxelGrid,
@@ -32,6 +34,19 @@ class FieldConfig(NetworkConfig):
     fine_samples: Count = 32  # further intervals of the fine network, placed by the coarse one
     # cells along the longest side of the scene; those that views show to be empty are skipped
     room_resolution: Annotated[int, Range(2, 1024)] = 64
+
+
+@dataclass(frozen=True)
+class OccupiedOnly:
+    """A sampler that invalidates the samples of another one in cells that cannot hold matter."""
+
+    occupancy: OccupancyMask
+    sampler: RaySampler
+
+    @torch.no_grad()
+    def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
+        samples = self.sampler(rays, jitter)
+        return replace(samples, valid=samples.valid & self.occupancy.holds(rays.at(samples.middles)))
 
 
 class Level(nn.Module):

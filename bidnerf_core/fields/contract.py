@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
 from bidnerf_core.devices import constant
@@ -35,10 +35,6 @@ class RaySpacing:
 
     exit: Float[Tensor, "*r"]  # metres along the ray
     radius: float  # metres: half the side of the uncontracted cube; infinite without contraction
-
-    def rows(self, numbers: Int[Tensor, "m"]) -> RaySpacing:
-        """Return the ``RaySpacing`` of the rays with these indices. ``exit`` must have shape (r,)."""
-        return RaySpacing(self.exit.index_select(0, numbers), self.radius)
 
     def coordinate(self, distance: Float[Tensor, "*r s"]) -> Float[Tensor, "*r s"]:
         """Convert distances along the rays (metres) to the coordinate."""
@@ -250,8 +246,7 @@ def backward_derivatives(
 
 def device_of(field: RadianceField) -> torch.device:
     """Return the device of a field's parameters or buffers, or of the first field that a dataclass wraps; else the CPU."""
-    tensors = (first for kind in ("parameters", "buffers") for first in _tensors_of(field, kind))
-    tensor = next(tensors, None)
+    tensor = next((first for kind in ("parameters", "buffers") for first in _tensors_of(field, kind)), None)
     return torch.device("cpu") if tensor is None else tensor.device
 
 

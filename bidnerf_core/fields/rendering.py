@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import interpolate, max_pool2d, pad
 
 from bidnerf_core.camera import Intrinsics, exposure_times, poses_of_rows
-from bidnerf_core.devices import constant, may_wait
+from bidnerf_core.devices import TensorRows, constant, may_wait
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import (
     DifferentiatedField,
@@ -31,7 +31,7 @@ from bidnerf_core.progress import check_cancelled
 
 
 @dataclass(frozen=True, eq=False)
-class Observations:
+class Observations(TensorRows):
     """Half-lines in a reference frame with the colours and distances that sensors measured along them.
 
     Examples are the pixels of an RGB-D image, the returns of a lidar and the points of structure from motion.
@@ -70,19 +70,7 @@ class Observations:
     @staticmethod
     def joined(parts: Sequence[Observations]) -> Observations:
         """Concatenate the rays of ``parts``, which share a reference frame, along the first axis."""
-        return _together(parts, torch.cat)
-
-    @staticmethod
-    def stacked(parts: Sequence[Observations]) -> Observations:
-        """Stack parts with equal numbers of rays along a new first axis."""
-        return _together(parts, torch.stack)
-
-    def __len__(self) -> int:
-        return len(self.distance)
-
-    def __getitem__(self, index: Tensor | slice | None) -> Observations:
-        """Select rays by an index along the first axis or by a mask; None adds an axis of length 1."""
-        return self._map(lambda part: part[index])
+        return Observations(*map(torch.cat, zip(*(vars(part).values() for part in parts), strict=True)))
 
     @property
     def measured(self) -> Bool[Tensor, "*p"]:
@@ -96,7 +84,7 @@ class Observations:
 
     def flattened(self) -> Observations:
         """Return these rays flattened to one axis."""
-        return self._map(lambda part: part.reshape(-1, *part.shape[self.distance.ndim :]))
+        return self.map(lambda part: part.reshape(-1, *part.shape[self.distance.ndim :]))
 
     def drawn(
         self,
@@ -113,7 +101,7 @@ class Observations:
 
     def to(self, device: torch.device | str | None, dtype: torch.dtype) -> Observations:
         """Return these rays on another device and in another floating-point type."""
-        return self._map(lambda part: part.to(device, dtype if part.is_floating_point() else part.dtype))
+        return self.map(lambda part: part.to(device, dtype if part.is_floating_point() else part.dtype))
 
     def rays(self, T_world_ref: SE3, bounds: SceneBounds) -> Rays:
         """Return the rays in the world, clipped to the scene's bounds; differentiable with respect to the transform.
@@ -126,13 +114,6 @@ class Observations:
             batch = T.translation.shape[:-1]
             T = SE3(T.rotation.reshape(*batch, *ones, 3, 3), T.translation.reshape(*batch, *ones, 3))
         return bounds.rays(T.apply(self.origins), T.rotate(self.directions))
-
-    def _map(self, change: Callable[[Tensor], Tensor]) -> Observations:
-        return Observations(*(change(part) for part in vars(self).values()))
-
-
-def _together(parts: Sequence[Observations], join: Callable[[tuple[Tensor, ...]], Tensor]) -> Observations:
-    return Observations(*map(join, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,31 +169,7 @@ def points_of(
     """Return the positions (metres, world) of the samples with these flat indices, and the directions of their rays."""
     ray = index // samples.valid.shape[-1]
     origins, directions = (part.reshape(-1, 3).index_select(0, ray) for part in (rays.origins, rays.directions))
-    middles = samples.middles.reshape(-1).index_select(0, index)
-    return origins + middles[:, None] * directions, directions
-
-
-def query_packed(field: RadianceField, rays: Rays, samples: RaySamples, room: int) -> tuple[FieldValues, RaySamples]:
-    """Return the field's values at the first ``room`` valid samples (r s), and the samples with only these left valid.
-
-    The field is always queried at ``room`` points, so that the host need not wait for the number of valid samples.
-    """
-    valid = samples.valid.reshape(-1)
-    total, room = valid.numel(), min(room, valid.numel())
-    order = valid.cumsum(0)
-    selected = valid & (order <= room)
-    slot = torch.arange(room, device=valid.device)
-    # An empty slot takes some sample of its own, since many gradients for the same point would be added one
-    # after another.
-    index = torch.cat([slot, slot[:1]]).index_copy(
-        0, torch.where(selected, order - 1, room), torch.arange(total, device=valid.device)
-    )[:room]
-    output = field.query(*points_of(rays, samples, index))
-    target = torch.where(slot < order[-1:], index, total)
-    density = output.density.new_zeros(total + 1).index_copy(0, target, output.density)[:-1]
-    rgb = output.rgb.new_zeros((total + 1, 3)).index_copy(0, target, output.rgb)[:-1]
-    values = FieldValues(density.view_as(samples.valid), rgb.view(*samples.valid.shape, 3))
-    return values, replace(samples, valid=selected.view_as(samples.valid))
+    return origins + samples.middles.reshape(-1).index_select(0, index)[:, None] * directions, directions
 
 
 class _Queried(torch.autograd.Function):
@@ -259,8 +216,7 @@ def render(
     """
     if isinstance(field, HitField):
         hits = field.hits(rays)
-        passed = torch.cumprod(1 - hits.alpha, dim=-1)
-        weights = hits.alpha * pad(passed, (1, 0), value=1.0)[..., :-1]
+        weights = hits.alpha * pad(torch.cumprod(1 - hits.alpha, dim=-1), (1, 0), value=1.0)[..., :-1]
         return _over(background, hits.rgb, weights, hits.samples, None)
     return render_samples(field, rays, field.sampler(rays, jitter), background)
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import Any, NoReturn, TypeVar
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NoReturn
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor, nn
-from torch.nn.functional import max_pool1d, pad
 
 from bidnerf_core.devices import may_wait
 from bidnerf_core.errors import InputError
@@ -28,15 +28,6 @@ from bidnerf_core.fields.contract import (
     levels,
 )
 from bidnerf_core.fields.rendering import query_samples, rendering_weights
-from bidnerf_core.fields.voxel_grid import OccupancyMask
-
-EVEN_SHARE = 0.25
-"""Fraction of the borders that ``Concentrated`` spreads evenly, so that matter missing from the guide is found."""
-TAIL = 0.005
-"""Fraction of a ray's weight, at either end, that ``Concentrated`` leaves to evenly spread intervals."""
-LARGEST_THICKNESS = 0.5
-"""Optical thickness to which ``Concentrated`` limits the guide's intervals. A coarse guide has a single
-density for a cell that is only partly dense; what lies behind the empty part must be found as well."""
 
 
 @dataclass(frozen=True)
@@ -53,36 +44,11 @@ class Stratified:
         limits = torch.stack([rays.near.detach(), rays.far.detach()], dim=-1)
         spacing = None if self.bounds is None else self.bounds.spacing(rays)
         near, far = (limits if spacing is None else spacing.coordinate(limits)).split(1, dim=-1)
-        borders = _levels(self.count + 1, near, jitter)
-        distances = near + (far - near) * borders
+        distances = near + (far - near) * even_borders(self.count + 1, near, jitter)
         if spacing is not None:
             distances = spacing.distance(distances)
         valid = (far > near).expand(*rays.near.shape, self.count)
         return RaySamples(distances[..., :-1], distances[..., 1:], valid)
-
-
-@dataclass(frozen=True)
-class OccupiedOnly:
-    """A sampler that invalidates the samples of another one in cells that cannot hold matter."""
-
-    occupancy: OccupancyMask
-    sampler: RaySampler
-
-    @torch.no_grad()
-    def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
-        samples = self.sampler(rays, jitter)
-        return replace(samples, valid=samples.valid & self.occupancy.holds(rays.at(samples.middles)))
-
-
-OfRays = TypeVar("OfRays", Rays, RaySamples)
-
-
-def rows_of(of: OfRays, index: Int[Tensor, "n"]) -> OfRays:
-    """Return the rays, or the samples of the rays, at these (flattened) indices."""
-    shape = of.near.shape if isinstance(of, Rays) else of.starts.shape[:-1]
-    parts = (getattr(of, field.name) for field in fields(of))
-    flat = (part.reshape(shape.numel(), *part.shape[len(shape) :]) for part in parts)
-    return type(of)(*(part.index_select(0, index) for part in flat))
 
 
 @dataclass(frozen=True)
@@ -181,88 +147,13 @@ class HierarchicalField(nn.Module):
         return self.fine.query(positions, directions)
 
 
-@dataclass(frozen=True)
-class Concentrated:
-    """A sampler of at most ``count`` intervals per ray, short where the weights of the field ``guide`` are large, and long elsewhere.
-
-    Three quarters of the borders divide the guide's weight over its own valid intervals into equal parts; the others
-    divide their length. Each new interval has the total length of the pieces that it replaces. A ray with ``count``
-    intervals or fewer keeps them. No gradient flows through the choice.
-    """
-
-    guide: RadianceField
-    count: int
-
-    @torch.no_grad()
-    def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
-        rough = gather_valid(self.guide.sampler(rays, jitter))
-        if rough.starts.shape[-1] <= self.count:
-            return rough
-        many = rough.valid.sum(-1) > self.count
-        # What the other rays keep: ``gathered`` puts the valid intervals first.
-        unchanged = [part[..., : self.count] for part in rough.parts]
-        # Selecting the rays in ``many`` makes the host wait for the device. Where it may not, all rays are concentrated.
-        if not may_wait(many.device):
-            samples = self._concentrate(rays, rough, jitter)
-            pairs = zip(samples.parts, unchanged, strict=True)
-            return RaySamples(*(torch.where(many[..., None], new, old) for new, old in pairs))
-        index = many.reshape(-1).nonzero()[:, 0]
-        samples = self._concentrate(rows_of(rays, index), rows_of(rough, index), jitter)
-        merged = (
-            old.reshape(-1, self.count).index_copy(0, index, new)
-            for new, old in zip(samples.parts, unchanged, strict=True)
-        )
-        return RaySamples(*merged).unflattened(many.shape)
-
-    def _concentrate(self, rays: Rays, rough: RaySamples, jitter: Generator | None) -> RaySamples:
-        length = (rough.ends - rough.starts).clamp(min=torch.finfo(rough.ends.dtype).tiny)
-        density = torch.minimum(query_samples(self.guide, rays, rough).density, LARGEST_THICKNESS / length)
-        return concentrate(rough, rendering_weights(density, rough), self.count, jitter)
-
-
-def concentrate(
-    samples: RaySamples, weights: Float[Tensor, "*r s"], count: int, jitter: Generator | None
-) -> RaySamples:
-    """Resample rays to ``count`` intervals that are short where the ``weights`` of ``samples`` are large, see ``Concentrated``."""
-    length = torch.where(samples.valid, samples.ends - samples.starts, 0)
-    laid = pad(length.cumsum(-1), (1, 0))  # borders of the intervals, laid end to end
-    # Borders by equal weight and by equal length, in the coordinate of the concatenated intervals.
-    blurred = max_pool1d(weights.reshape(-1, 1, weights.shape[-1]), 3, stride=1, padding=1).view_as(weights)
-    mass = torch.where(length > 0, blurred, 0) + 1e-5 * length / laid[..., -1:].clamp(min=1e-30)
-    cdf = pad(mass.cumsum(-1) / mass.sum(-1, keepdim=True).clamp(min=1e-30), (1, 0))
-    even = max(2, round(EVEN_SHARE * (count + 1)))
-    dense = TAIL + (1 - 2 * TAIL) * _levels(count + 1 - even, laid, jitter)
-    by_weight = _interpolate(dense, cdf, laid)
-    by_length = _levels(even, laid, jitter) * laid[..., -1:]
-    border = torch.cat([by_weight, by_length], dim=-1).sort(dim=-1).values
-    middle, half = (border[..., 1:] + border[..., :-1]) / 2, border.diff(dim=-1) / 2
-    owner = torch.searchsorted(laid[..., 1:].contiguous(), middle.contiguous()).clamp(max=length.shape[-1] - 1)
-    at = samples.starts.gather(-1, owner) + (middle - laid.gather(-1, owner))
-    starts, ends = at - half, at + half
-    # Neither rounding nor an interval that spans a gap may make two intervals overlap.
-    between = (ends[..., :-1] + starts[..., 1:]) / 2
-    starts = torch.cat([starts[..., :1], torch.maximum(starts[..., 1:], between)], dim=-1)
-    ends = torch.cat([torch.minimum(ends[..., :-1], between), ends[..., -1:]], dim=-1)
-    return RaySamples(starts, torch.maximum(starts, ends), (half > 0) & samples.valid.any(-1, keepdim=True))
-
-
-def _levels(count: int, like: Float[Tensor, "*r b"], jitter: Generator | None) -> Float[Tensor, "*r n"]:
+def even_borders(count: int, like: Float[Tensor, "*r b"], jitter: Generator | None) -> Float[Tensor, "*r n"]:
     """Return ``count`` evenly spaced numbers from 0 to 1; with jitter, the inner ones are shifted by up to half a step."""
     levels = torch.linspace(0, 1, count, dtype=like.dtype, device=like.device).repeat(*like.shape[:-1], 1)
     if jitter is not None and count > 2:
         shift = torch.rand((*like.shape[:-1], count - 2), generator=jitter, device=jitter.device) - 0.5
         levels[..., 1:-1] += shift.to(levels) / (count - 1)
     return levels
-
-
-def _interpolate(
-    at: Float[Tensor, "*r n"], x: Float[Tensor, "*r s"], y: Float[Tensor, "*r s"]
-) -> Float[Tensor, "*r n"]:
-    """Evaluate at ``at`` the piecewise linear function through the points (x, y), x ascending."""
-    right = torch.searchsorted(x.contiguous(), at.contiguous(), right=True).clamp(1, x.shape[-1] - 1)
-    x0, x1, y0, y1 = (part.gather(-1, index) for part in (x, y) for index in (right - 1, right))
-    slope = (y1 - y0) / (x1 - x0).clamp(min=torch.finfo(x.dtype).tiny)
-    return torch.minimum(torch.maximum(y0 + (at - x0) * slope, y0), y1)
 
 
 class ScaledField(nn.Module):
@@ -279,7 +170,7 @@ class ScaledField(nn.Module):
     @property
     def sampler(self) -> RaySampler:
         """The sampler of the field, for rays in the scaled world."""
-        return ScaledSampler(self.trained.sampler, self.scale)
+        return partial(_sample_scaled, self.trained.sampler, self.scale)
 
     @property
     def levels(self) -> tuple[RadianceField, ...]:
@@ -306,8 +197,7 @@ class ScaledHitField(ScaledField):
 
     def hits(self, rays: Rays) -> RayHits:
         """Return the hits of rays in the scaled world."""
-        trained: HitField = self.trained
-        hits = trained.hits(shrunk(rays, self.scale))
+        hits = self.trained.hits(shrunk(rays, self.scale))
         return replace(hits, distance=hits.distance * self.scale)
 
 
@@ -316,8 +206,7 @@ class ScaledSplatField(ScaledHitField):
 
     def splats(self) -> Splats:
         """Return the primitives in the scaled world."""
-        trained: SplatField = self.trained
-        splats = trained.splats()
+        splats = self.trained.splats()
         return replace(splats, positions=splats.positions * self.scale, radius=splats.radius * self.scale)
 
 
@@ -333,17 +222,10 @@ def shrunk(rays: Rays, scale: float) -> Rays:
     return Rays(rays.origins / scale, rays.directions, rays.near / scale, rays.far / scale)
 
 
-@dataclass(frozen=True)
-class ScaledSampler:
-    """Wraps a sampler for rays in a world that is ``scale`` times as large as that of the wrapped sampler."""
-
-    sampler: RaySampler
-    scale: float
-
-    def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
-        """Return the samples of rays in the scaled world."""
-        samples = self.sampler(shrunk(rays, self.scale), jitter)
-        return replace(samples, starts=samples.starts * self.scale, ends=samples.ends * self.scale)
+def _sample_scaled(sampler: RaySampler, scale: float, rays: Rays, jitter: Generator | None = None) -> RaySamples:
+    """Return the samples of rays in a world that is ``scale`` times as large as that of ``sampler``."""
+    samples = sampler(shrunk(rays, scale), jitter)
+    return replace(samples, starts=samples.starts * scale, ends=samples.ends * scale)
 
 
 def trained_field(field: RadianceField) -> RadianceField:

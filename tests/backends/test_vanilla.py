@@ -14,7 +14,6 @@ from bidnerf.testing import SIDE, BackendContract, Recorder, rgbd_views
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import (
-    OccupiedOnly,
     RaySampler,
     RaySamples,
     encoding_width,
@@ -26,6 +25,7 @@ from bidnerf_core.fields import (
 from bidnerf_core.frames import View
 from bidnerf_core.training import RayBank, Supervision, ray_termination, supervised_loss
 from bidnerf_vanilla import VanillaConfig, VanillaField, backend
+from bidnerf_vanilla.field import OccupiedOnly
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig
 from bidnerf_vanilla.recipe import step_outcome
 from simulated_device import StaysOnDevice

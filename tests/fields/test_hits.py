@@ -88,8 +88,7 @@ def test_hits_are_composited_from_the_nearest_on() -> None:
 
 
 def test_rays_that_meet_nothing_see_the_background() -> None:
-    away = replace(rays(), directions=-rays().directions)
-    found = render(Sheets(), away, (0.1, 0.2, 0.3))
+    found = render(Sheets(), replace(rays(), directions=-rays().directions), (0.1, 0.2, 0.3))
     assert torch.allclose(found.rgb, torch.tensor([0.1, 0.2, 0.3]).double().expand_as(found.rgb))
 
 

@@ -21,8 +21,7 @@ PAPERS = Objective((colour_term(HUBER), depth_term(HUBER, 1.0)))
 
 
 def loss(problem: Problem, T_world_last: SE3, wide: float = 1.0) -> torch.Tensor:
-    generator = torch.Generator().manual_seed(7)
-    pixels = draw(problem.views, 60, uniform, generator, torch.float64)
+    pixels = draw(problem.views, 60, uniform, torch.Generator().manual_seed(7), torch.float64)
     rays = widen(pixels.rays(T_world_last, problem.bounds), wide)
     return PAPERS.loss(render(problem.field, rays, problem.bounds.background), pixels)
 

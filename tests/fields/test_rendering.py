@@ -112,8 +112,7 @@ def test_derivatives_of_a_rendering_with_gaps_are_the_numerical_ones() -> None:
     assert 0 < int(samples.valid.sum()) < samples.valid.numel()
 
     def function(origins: torch.Tensor, directions: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        moved = Rays(origins, directions, rays.near, rays.far)
-        rendering = render_samples(field, moved, samples, BLUE)
+        rendering = render_samples(field, Rays(origins, directions, rays.near, rays.far), samples, BLUE)
         return rendering.rgb, rendering.distance, rendering.opacity, rendering.weights
 
     of = (rays.origins.clone().requires_grad_(), rays.directions.clone().requires_grad_())
@@ -151,8 +150,7 @@ def test_absorption_in_a_homogeneous_ball(density: float) -> None:
     half = math.sqrt(radius**2 - axis_distance**2)
     near, far = torch.tensor([3 - half]).double(), torch.tensor([3 + half]).double()
     rays = Rays(origin, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), near, far)
-    field = replace(ball, sampler=Stratified(4000))
-    rendering = render(field, rays, BLUE)
+    rendering = render(replace(ball, sampler=Stratified(4000)), rays, BLUE)
     chord = 2 * half
     assert float(rendering.opacity) == pytest.approx(1 - math.exp(-density * chord), abs=1e-7)
     if density == 0:
@@ -192,8 +190,7 @@ def test_importance_sampling_gathers_where_the_weight_is() -> None:
     inside = found[(found > 2) & (found < 3)]
     assert float(inside.mean()) == pytest.approx(2.5, abs=0.01)
     assert float(inside.std()) == pytest.approx(1 / math.sqrt(12), abs=0.01)
-    field = HomogeneousBall(radius=0.5, density=30.0)
-    finer = Importance(replace(field, sampler=Stratified(16)), 32)(rays)
+    finer = Importance(replace(HomogeneousBall(radius=0.5, density=30.0), sampler=Stratified(16)), 32)(rays)
     assert finer.starts.shape == (1, 16 + 32)
     assert bool((finer.ends >= finer.starts).all())
 

@@ -13,7 +13,6 @@ from balls import HomogeneousBall
 from bidnerf.scenes import GaussianBlobs
 from bidnerf.testing import check_background, check_intervals, check_rays_alone, check_repeatable
 from bidnerf_core.fields import (
-    Concentrated,
     FieldValues,
     Importance,
     RadianceField,
@@ -24,6 +23,7 @@ from bidnerf_core.fields import (
     Stratified,
     render,
 )
+from bidnerf_hashgrid.concentration import Concentrated
 from bidnerf_hashgrid.occupancy import OccupancyGrid
 from voxels import cell_centres
 
