@@ -20,7 +20,7 @@ from torch.nn.functional import normalize
 
 from bidnerf_core.captures.report import Arrangement, CoverageRecord, Gap
 from bidnerf_core.frames import View
-from bidnerf_core.geometry import SE3
+from bidnerf_core.geometry import SE3, sphere
 from bidnerf_core.mapping import DEFAULT_LANDMARKS, TrackedKeypoints, TrackedViews, viewing_cones
 
 UpSource = Literal["gravity", "planes", "cameras"]
@@ -178,8 +178,8 @@ def shows_distances(views: Sequence[View], tracked: TrackedViews | None) -> bool
         return False
     if tracked is None or not tracked.matched.count:
         return True
-    angle = _median(_cones_deg(tracked.matched))
-    return angle >= DEFAULT_LANDMARKS.parallax or len(tracked.triangulate(DEFAULT_LANDMARKS)[1]) >= 50
+    has_parallax = _median(_cones_deg(tracked.matched)) >= DEFAULT_LANDMARKS.parallax
+    return has_parallax or len(tracked.triangulate(DEFAULT_LANDMARKS)[1]) >= 50
 
 
 def _cones_deg(seen: TrackedKeypoints) -> Float[Tensor, "n"]:
@@ -241,9 +241,7 @@ def _planes(normals: Float[Tensor, "n 3"] | None) -> list[tuple[Tensor, float, U
     if normals is None or not len(normals):
         return []
     some = normals.detach().cpu().double()[:: max(1, len(normals) // 20_000)]
-    number = torch.arange(DIRECTIONS, dtype=torch.float64) + 0.5  # a Fibonacci lattice on the half sphere
-    down, around = torch.acos(1 - number / DIRECTIONS), math.pi * (1 + math.sqrt(5)) * number
-    tried = torch.stack([around.cos() * down.sin(), around.sin() * down.sin(), down.cos()], dim=-1)
+    tried = sphere(2 * DIRECTIONS)[:DIRECTIONS]  # the upper half
     share = ((some.float() @ tried.float().mT).abs() > 1 - CHANCE).double().mean(0)
     planes = list[tuple[Tensor, float, UpSource]]()
     for _ in range(6):

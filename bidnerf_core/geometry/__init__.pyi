@@ -14,6 +14,7 @@ from .se3 import perturb as perturb
 from .se3 import pose_from_matrix as pose_from_matrix
 from .se3 import random_units as random_units
 from .se3 import skew as skew
+from .se3 import sphere as sphere
 from .similarity import RIGID_TO as RIGID_TO
 from .similarity import CovarianceConvention as CovarianceConvention
 from .similarity import LengthUnit as LengthUnit

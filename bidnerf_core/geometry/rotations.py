@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -27,11 +28,7 @@ def cross_matrix(phi: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 
 def rotation_matrix(phi: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """Return the rotation matrix of the rotation vector ``phi`` (radians), by Rodrigues' formula."""
-    cross, angle = cross_matrix(phi), math.sqrt(float(phi @ phi))
-    if angle < SERIES_ANGLE:
-        return np.eye(3) + (1 - angle**2 / 6) * cross + 0.5 * cross @ cross
-    half = math.sin(angle / 2) / angle
-    return np.eye(3) + math.sin(angle) / angle * cross + 2 * half**2 * cross @ cross
+    return cv2.Rodrigues(phi)[0]
 
 
 def rotation_vector(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:

@@ -86,8 +86,7 @@ class SE3:
 
     def matrix(self) -> Float[Tensor, "*b 4 4"]:
         top = torch.cat([self.rotation, self.translation[..., None]], dim=-1)
-        bottom = constant((0.0, 0.0, 0.0, 1.0), top).expand(*top.shape[:-2], 1, 4)
-        return torch.cat([top, bottom], dim=-2)
+        return torch.cat([top, constant((0.0, 0.0, 0.0, 1.0), top).expand(*top.shape[:-2], 1, 4)], dim=-2)
 
     def quaternion(self, order: QuaternionOrder) -> Float[Tensor, "*b 4"]:
         """Return the unit quaternion of the rotation, with its scalar part w >= 0.
@@ -265,6 +264,14 @@ def random_units(count: int, generator: Generator) -> Float[Tensor, "n 3"]:
     """Return ``count`` unit vectors, uniformly distributed on the sphere (float64)."""
     normal = torch.randn((count, 3), generator=generator, dtype=torch.float64)
     return torch.nn.functional.normalize(normal, dim=-1)
+
+
+def sphere(count: int) -> Float[Tensor, "n 3"]:
+    """Return ``count`` unit directions spread evenly over the sphere (Fibonacci lattice), from the north pole down, in float64."""
+    number = torch.arange(count, dtype=torch.float64) + 0.5
+    z = 1 - 2 * number / count
+    azimuth, flat = number * math.pi * (3 - math.sqrt(5)), (1 - z * z).sqrt()
+    return torch.stack([flat * azimuth.cos(), flat * azimuth.sin(), z], dim=-1)
 
 
 def perturb(T_true: SE3, translation: float, rotation_deg: float, seed: int) -> SE3:

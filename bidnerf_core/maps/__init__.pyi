@@ -17,7 +17,6 @@ from .importers import bounds_about as bounds_about
 from .importers import importer_of as importer_of
 from .importing import ImportOptions as ImportOptions
 from .importing import import_map as import_map
-from .importing import sphere as sphere
 from .known_lengths import ScaleFit as ScaleFit
 from .known_lengths import factor_of_distance as factor_of_distance
 from .known_lengths import factor_of_poses as factor_of_poses

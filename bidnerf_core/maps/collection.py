@@ -221,8 +221,6 @@ def maps_in(folder: Path) -> list[Path]:
     """Return the folder itself if it is a map, else its subfolders that are maps, by name."""
     if (folder / DESCRIPTION).exists():
         return [folder]
-    if not folder.is_dir():
-        return []
     return sorted(path.parent for path in folder.glob(f"*/{DESCRIPTION}"))
 
 

@@ -22,7 +22,7 @@ from bidnerf_core.devices import working_device
 from bidnerf_core.errors import InputError, InputWarning, amount
 from bidnerf_core.fields import NoField, RadianceField, Rays, SceneBounds, device_of, render
 from bidnerf_core.frames import BLACK, Frame, View, draw, uniform
-from bidnerf_core.geometry import SE3, LengthUnit, Similarity, look_at
+from bidnerf_core.geometry import SE3, LengthUnit, Similarity, look_at, sphere
 from bidnerf_core.io import to_plain
 from bidnerf_core.mapping import (
     BakeConfig,
@@ -290,8 +290,7 @@ def ratio_to_measured_depth(field: RadianceField, bounds: SceneBounds, views: Se
 
 
 def _bake(scene: Map, found: ImportedField, views: Sequence[View], config: BakeConfig) -> Map:
-    name = scene.info.data
-    tracked: TrackedViews | None = None
+    name, tracked = scene.info.data, None
 
     def with_surface(scene: Map) -> Map:
         surface = None
@@ -303,18 +302,13 @@ def _bake(scene: Map, found: ImportedField, views: Sequence[View], config: BakeC
             )
         return scene.with_surface(views, config, surface)
 
-    def with_landmarks(scene: Map) -> Map:
-        nonlocal tracked
-        scene, tracked = scene.with_landmarks(views, not views)
-        return scene
-
     if not views and found.is_coloured:
         log.info(
             f"{name}: landmarks are from rendered images, which match photos less well; `photos` builds them from photos,"
             " as in training"
         )
     if views or found.is_coloured:
-        scene = bake_if_possible(scene, with_landmarks)
+        scene, tracked = scene.with_landmarks(views, not views)
     scene = bake_if_possible(scene, with_surface)
     return scene if tracked is None else scene.with_survey(views, tracked)
 
@@ -390,11 +384,3 @@ def _within(places: Float[Tensor, "p 3"], distance: Float[Tensor, "p d"], up: tu
         away = torch.minimum(away, (places - eye).norm(dim=-1))
         number = int(away.argmax())
     return poses
-
-
-def sphere(count: int) -> Float[Tensor, "n 3"]:
-    """Return ``count`` unit directions spread evenly over the sphere (Fibonacci lattice), in float64."""
-    number = torch.arange(count, dtype=torch.float64) + 0.5
-    z = 1 - 2 * number / count
-    azimuth, flat = number * math.pi * (3 - math.sqrt(5)), (1 - z * z).sqrt()
-    return torch.stack([flat * azimuth.cos(), flat * azimuth.sin(), z], dim=-1)

@@ -15,9 +15,10 @@ import os
 import re
 import secrets
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, cast
 
 import torch
@@ -193,8 +194,8 @@ class Checkpoints:
 
     States are saved to ``folder``, or not at all if that is None; ``info`` describes the last saved state.
     Progress is reported to the current job, which may also stop the training. ``state`` is the training state
-    to resume from, ``seconds`` is the time between checkpoints, and ``landmarks`` are stored with the first
-    checkpoint if they are not in the folder yet.
+    to resume from, ``seconds`` is the time between checkpoints, ``landmarks`` are stored with the first
+    checkpoint if they are not in the folder yet, and ``beside`` with the state of each.
     """
 
     def __init__(
@@ -204,8 +205,9 @@ class Checkpoints:
         state: TrainingState | None = None,
         seconds: float = USUAL_SECONDS,
         landmarks: LandmarkMap | None = None,
+        beside: Mapping[str, Tensor] = MappingProxyType({}),
     ) -> None:
-        self.info, self.folder = info, folder
+        self.info, self.folder, self._beside = info, folder, beside
         self._state, self._seconds, self._job = state, seconds, current_job()
         self._step = self._total = info.step
         self._landmarks = landmarks
@@ -237,6 +239,7 @@ class Checkpoints:
         if self.folder is not None:
             if info.weights:  # the first save may replace another map, whose anchor does not count
                 info = replace(info, anchor=load_info(self.folder).anchor)
+            state = replace(state, optimizer={**state.optimizer, **self._beside})
             info = write_parts(self.folder, info, state, landmarks=self._landmarks, keep=True)
             self._landmarks = None
         self.info = info
@@ -376,8 +379,7 @@ def content_digest(field: RadianceField, surface: SurfaceMap | None, landmarks: 
     return hashed.hexdigest()
 
 
-@contextlib.contextmanager
-def map_folder(out: Path, overwrite: bool) -> Iterator[None]:
+def map_folder(out: Path, overwrite: bool) -> contextlib.AbstractContextManager[None]:
     """Prepare a folder for a map and hold its lock within the context, see ``output_folder``."""
 
     def is_leftover(file: Path) -> bool:
@@ -391,8 +393,7 @@ def map_folder(out: Path, overwrite: bool) -> Iterator[None]:
             return None
         return None if stopped is None else f"holds a map, and {stopped}"
 
-    with output_folder(out, overwrite, is_leftover, describe):
-        yield
+    return output_folder(out, overwrite, is_leftover, describe)
 
 
 def _sweep(folder: Path) -> None:

@@ -65,7 +65,7 @@ class MapSummary:
             if surface is None
             else {
                 "cell": surface.cell,  # side of a cell of its index
-                "cells": surface.stored_cells,
+                "cells": len(surface.index.entries),  # one per cell near the surface, and one per several far from it
                 "MiB": round(surface.mebibytes, 1),
             },
             "landmarks": 0 if landmarks is None else len(landmarks),

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, cast
 
 import torch
@@ -101,6 +102,8 @@ class TrainOptions(MapOptions):
 
 
 USUAL_TRAINING = TrainOptions()
+TRACKS = "tracks"
+"""The name, in the state of an interrupted training, of the labels of the keypoints' tracks."""
 
 
 class OtherSettings(InputError):
@@ -205,7 +208,8 @@ def train(
         scene = Map(info, NoField())
         # A map that is already there stays until the first checkpoint.
         if baking is not None and folder is not None and not (folder / DESCRIPTION).exists():
-            scene = replace(scene, info=write_parts(folder, info, TrainingState(0, {}, {})), folder=folder)
+            begun = TrainingState(0, {}, _stored_tracks(taken.tracked))
+            scene = replace(scene, info=write_parts(folder, info, begun), folder=folder)
         return _complete(scene, taken.views, taken.tracked, options, baking, out=folder)
 
 
@@ -288,7 +292,8 @@ def resume(
         read, views = views_again(info, posed, images, options.depth_points, options.point_choice, out)
         _check_same_views(out, info, read, images.split)
         # These are the keypoints and views with which training began.
-        tracked, views = track_landmarks(views, info.landmark_features, True, read.depth_unit)
+        labels = (read_part(out, info, "training") or {}).get(TRACKS)
+        tracked, views = track_landmarks(views, info.landmark_features, True, read.depth_unit, labels)
         if info.complete or finish:
             scene = load_map(out, device)
             if not info.complete:
@@ -401,7 +406,7 @@ def _complete(
         scene, tracked = scene.with_landmarks(views, tracked=tracked)
     scene = replace(scene, folder=out or scene.folder)
     if not scene.info.complete:
-        scene = train_field(views, scene, options, state)
+        scene = train_field(views, scene, options, state, beside=_stored_tracks(tracked))
     if baking is not None and scene.has_field:
         if scene.surface is None:
             scene = bake_if_possible(scene, lambda whole: whole.with_surface(views, baking))
@@ -414,21 +419,27 @@ def _complete(
     return scene
 
 
+def _stored_tracks(tracked: TrackedViews | None) -> dict[str, Tensor]:
+    """Return the labels of the tracks, with which a resumed training need not match the keypoints again."""
+    return {} if tracked is None else {TRACKS: tracked.observations.point.int()}
+
+
 def train_field(
     views: Sequence[View],
     scene: Map,
     options: TrainOptions,
     state: TrainingState | None = None,
     weights: dict[str, Tensor] | None = None,
+    beside: Mapping[str, Tensor] = MappingProxyType({}),
 ) -> Map:
     """Train the field described by a map to completion: from ``state``, from the ``weights`` of a field, or from scratch.
 
-    The poses and depths of ``views`` are in the field's length unit. Raises ``Cancelled`` if training is stopped.
+    What is ``beside`` is stored with each checkpoint. The poses and depths of ``views`` are in the field's length unit. Raises ``Cancelled`` if training is stopped.
     """
     out, device = scene.folder, working_device(options.device)
     backend, where = load_backend(scene.info.backend, str(out or "")), scene.name
     unsaved = scene.landmarks if scene.info.landmarks is None else None
-    report = Checkpoints(scene.info, out, state, options.checkpoint_seconds, unsaved)
+    report = Checkpoints(scene.info, out, state, options.checkpoint_seconds, unsaved, beside)
     del state  # the report frees it once training resumes from it
     field = move_to(build_field(scene.info, where), device)
     if weights is not None:

@@ -89,8 +89,7 @@ def test_an_update_leads_to_the_other_transform(size: float) -> None:
     start, xi = (torch.randn((50, 6), generator=generator, dtype=torch.float64) for _ in range(2))
     T = SE3.exp(start)
     xi = size * xi / xi[:, 3:].norm(dim=-1, keepdim=True)
-    found = T.update_to(T.retract(xi))
-    torch.testing.assert_close(found, xi, rtol=1e-8, atol=1e-14)
+    torch.testing.assert_close(T.update_to(T.retract(xi)), xi, rtol=1e-8, atol=1e-14)
 
 
 def test_batches_broadcast_against_leading_axes() -> None:

@@ -33,8 +33,7 @@ def test_of_points_on_a_line_the_scale_is_known() -> None:
 
 
 def test_a_mirror_image_is_answered_with_a_rotation() -> None:
-    mirrored = CLOUD * torch.tensor([1.0, 1.0, -1.0])
-    found = fit_similarity(CLOUD, mirrored)
+    found = fit_similarity(CLOUD, CLOUD * torch.tensor([1.0, 1.0, -1.0]))
     assert float(torch.linalg.det(found.T_target_source.rotation)) == pytest.approx(1)
 
 

@@ -69,8 +69,7 @@ def test_all_that_was_seen_is_there() -> None:
 def test_colours_are_those_of_the_scene() -> None:
     blue = torch.tensor([0.2, 0.4, 0.8])
     scene = baked.one_solid(Box((0.5, 0.5, 0.5)), lambda points, normals: blue.expand(len(points), 3))
-    flat = replace(scene, contrast=0.0)
-    surface = measured(baked.images(flat, 8, seed=0))
+    surface = measured(baked.images(replace(scene, contrast=0.0), 8, seed=0))
     assert torch.allclose(surface.surfels.rgb, blue, atol=1e-5)
 
 

@@ -65,8 +65,7 @@ class Capture:
         """Where each camera sees each point in its last row, pixels; what image motions differ in, if translation and
         rotation make up for each other.
         """
-        last = self.poses @ SE3.exp(0.5 * motion)
-        local = last[:, None].inverse().apply(self.points)
+        local = (self.poses @ SE3.exp(0.5 * motion))[:, None].inverse().apply(self.points)
         return FOCAL * local[..., :2] / local[..., 2:]
 
 
@@ -238,7 +237,6 @@ def test_points_without_parallax_do_no_harm() -> None:
     local = turned[image].inverse().apply(capture.points.repeat(VIEWS, 1))
     seen = replace(capture.seen(turned), image=local[:, :2] / local[:, 2:])
     given = turned.retract(errors())
-    start = at_rest(given, capture.points)
-    found = adjust_bundle(seen, start, prior(given), capture.accuracy).T_world_camera
+    found = adjust_bundle(seen, at_rest(given, capture.points), prior(given), capture.accuracy).T_world_camera
     assert bool(found.is_rigid().all())
     assert off(relative(found), relative(turned))[1] < 0.5 * off(relative(given), relative(turned))[1]

@@ -82,8 +82,7 @@ def test_beyond_the_grid_its_border_counts(generator: Generator) -> None:
 
 
 def solid(shape: Shape) -> tuple[SurfaceMap, Primitive]:
-    scene = baked.one_solid(shape, PAINT)
-    return baked.baked(scene, 40), Primitive(shape, SE3.identity(), PAINT)
+    return baked.baked(baked.one_solid(shape, PAINT), 40), Primitive(shape, SE3.identity(), PAINT)
 
 
 def towards(targets: Tensor, generator: Generator) -> tuple[Tensor, Tensor]:

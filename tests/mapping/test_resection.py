@@ -154,8 +154,7 @@ def test_true_intrinsics_project_as_the_states_do() -> None:
     rotation, zero = torch.eye(3, dtype=torch.float64).expand(2, 3, 3), torch.zeros_like(points)
     flat = project(states, points, Sights(points[:, :2], zero[:, 0], rotation, zero)).image[0]
     expected = flat * FOCAL + torch.tensor([320.0, 240.0])
-    true = true_intrinsics(stated, states.nuisances[0, CAMERA])
-    torch.testing.assert_close(true.project(points), expected)
+    torch.testing.assert_close(true_intrinsics(stated, states.nuisances[0, CAMERA]).project(points), expected)
 
 
 def test_rows_of_upright_images_are_their_columns() -> None:

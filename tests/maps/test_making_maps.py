@@ -156,7 +156,10 @@ def test_what_was_finished_is_kept_when_a_stage_is_cancelled_and_finish_ends_it(
     else:
         assert 0 < half.info.step < tiny.STEPS
         assert bn.Localizer(half, warm_up=False)(unseen().frame).converged
-    done = bn.resume(out, views, bake=BAKE, finish=True)
+    progress = list[Progress]()
+    done = bn.resume(out, views, bake=BAKE, finish=True, progress=progress.append)
+    matched = [now for now in progress if now.stage == "landmarks" and now.total > len(views)]
+    assert (len(matched) > 0) == (stage == "baking")  # the matches are kept until the field is complete
     assert (done.info.complete, done.info.step) == (True, half.info.step)
     assert torch.equal(require(done.landmarks).positions, require(half.landmarks).positions)
     with refused(found="nothing to resume"):

@@ -140,8 +140,7 @@ def test_renderings_are_from_poses_of_the_users_world() -> None:
 
 
 def test_exports_are_in_the_users_world(tmp_path: Path) -> None:
-    landmarks = require(far().landmarks)
-    expected = landmarks.positions.double() + OFFSET
+    expected = require(far().landmarks).positions.double() + OFFSET
     for to in ("ply", "colmap", "transforms.json"):
         export_map(far(), tmp_path / to, to)
     for part in ("surface", "landmarks", "cameras"):

@@ -70,8 +70,7 @@ def adjust_bundle(
         check_cancelled("bundle adjustment")
         of_images, of_points = system.step(damping)
         motion = state.motion + of_images[:, 6:] if of_images.shape[1] > 6 else state.motion
-        poses = state.T_world_camera.retract(of_images[:, :6])
-        moved = Adjustment(poses, state.points + of_points, motion)
+        moved = Adjustment(state.T_world_camera.retract(of_images[:, :6]), state.points + of_points, motion)
         tried = linearize(sightings, moved, prior, noise, correlation)
         if not tried.cost <= system.cost:
             damping *= 10

@@ -7,13 +7,15 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import normalize
 
+from bidnerf_core.devices import TensorRows
 from bidnerf_core.geometry import inlier_weight, mad_deviation
 from bidnerf_core.mapping.resection.states import by_camera_point, pinhole
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
+class Sightings(TensorRows):
     """Observations of points in images with known poses; points and images are identified by number. Float64."""
 
     point: Int[Tensor, "m"]
@@ -24,17 +26,10 @@ class Sightings:
     focal: Float[Tensor, "m"]  # pixels; residuals are multiplied by it
     exposure_times: Float[Tensor, "m"]  # see the function ``exposure_times``
 
-    def __getitem__(self, index: Tensor) -> Sightings:
-        return Sightings(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
-
-    def __len__(self) -> int:
-        return len(self.point)
-
     def directions(self) -> Float[Tensor, "m 3"]:
         """Return unit vectors (world) from the cameras towards the observed points."""
         ray = torch.cat([self.image, torch.ones_like(self.image[:, :1])], dim=-1)
-        world = (self.rotation.mT @ ray[..., None])[..., 0]
-        return world / torch.linalg.vector_norm(world, dim=-1, keepdim=True)
+        return normalize((self.rotation.mT @ ray[..., None])[..., 0], dim=-1)
 
     def in_camera(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 3"]:
         """Transform each observation's point to the frame of the camera that observes it."""
@@ -89,21 +84,15 @@ def _normal_equations(
 
 def parallax(sightings: Sightings, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
     """Return twice the largest angle (radians) between a point's rays and their mean; 0 for points without observations."""
-    away = points[sightings.point] - sightings.centre
-    d = away / torch.linalg.vector_norm(away, dim=-1, keepdim=True).clamp(min=1e-300)
-    mean = sum_by(d, sightings.point, len(points))
-    mean = mean / torch.linalg.vector_norm(mean, dim=-1, keepdim=True).clamp(min=1e-300)
-    sine = torch.linalg.vector_norm(torch.linalg.cross(d, mean[sightings.point]), dim=-1)
-    largest = torch.zeros(len(points), dtype=d.dtype)
-    return 2 * largest.scatter_reduce(0, sightings.point, sine, "amax").clamp(max=1).asin()
+    towards = normalize(points[sightings.point] - sightings.centre, dim=-1, eps=1e-300)
+    return 2 * viewing_cones(towards, sightings.point, len(points))[1]
 
 
 def viewing_cones(
     directions: Float[Tensor, "m 3"], point: Int[Tensor, "m"], count: int
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
     """Return the mean of each point's ``directions`` (unit), and the largest angle (radians) between it and one of them."""
-    mean = sum_by(directions, point, count) / torch.bincount(point, minlength=count).clamp(min=1)[:, None]
-    mean = mean / torch.linalg.vector_norm(mean, dim=-1, keepdim=True).clamp(min=1e-300)
+    mean = normalize(sum_by(directions, point, count), dim=-1, eps=1e-300)
     cosine = (directions * mean[point]).sum(-1).clamp(-1, 1)
     least = torch.ones(count, dtype=cosine.dtype).scatter_reduce(0, point, cosine, "amin")
     return mean, least.acos()
@@ -120,8 +109,7 @@ def noise(sightings: Sightings, points: Float[Tensor, "n 3"]) -> float:
         return 1.0
     seen = torch.bincount(sightings.point, minlength=len(points))
     spare = (1 - 1.5 / seen[sightings.point]).clamp(min=0.25)  # (2 m - 3) / 2 m for m observations
-    residual = sightings.residuals(points) / spare.sqrt()[:, None]
-    return mad_deviation(residual)
+    return mad_deviation(sightings.residuals(points) / spare.sqrt()[:, None])
 
 
 def damp(blocks: Float[Tensor, "b k k"], damping: float = 0.0, least: float = 1e-6) -> Float[Tensor, "b k k"]:

@@ -83,8 +83,7 @@ def pose_updates(
     """
     sightings, image = tracked.sightings, tracked.image
     count = torch.bincount(image)
-    seen = torch.bincount(sightings.point)[sightings.point].double()
-    views = sum_by(seen, image, len(count)) / count
+    views = sum_by(torch.bincount(sightings.point)[sightings.point].double(), image, len(count)) / count
     factor = ((1 + 1 / views) / (1 - 1 / views)).sqrt()
     known, updates = (count >= LEAST_VISIBLE_POINTS).nonzero()[:, 0], dict[int, Float[Tensor, "6"]]()
     known = known[:: 1 if most is None else max(1, ceil(len(known) / most))]
@@ -148,15 +147,11 @@ class TrackedViews:
     # Positions (metres, world, float64) of the points by number, if they are known; otherwise they are triangulated.
     points: Float[Tensor, "p 3"] | None = None
 
-    @property
-    def detector(self) -> Features:
-        """The detector of the keypoints."""
-        return find_features(self.features) if isinstance(self.features, str) else self.features
-
     def detector_of(self, view: View, number: int) -> Features:
         """Return a detector for queries with ``view``, which is image ``number``; the detector reuses the image's keypoints."""
         known = (view.frame.rgb_bytes, self.observations.images[number].keypoints)
-        return CachedFeatures(partial(detect, self.detector), [known])
+        features = find_features(self.features) if isinstance(self.features, str) else self.features
+        return CachedFeatures(partial(detect, features), [known])
 
     def landmarks(self, config: LandmarkConfig, report: Callable[[str], None] = lambda sentence: None) -> LandmarkMap:
         """Return the landmarks built from the tracks. Raises ``InputError`` if there are none."""
@@ -167,9 +162,9 @@ class TrackedViews:
                 f"no landmarks found in {images} images:",
                 expected="texture that several images show from different places",
             )
-        moving = float((self.motion != 0).any(1).double().mean())
-        name = self.features if isinstance(self.features, str) else ""
-        name = USUAL_FEATURES if isinstance(self.features, Sift) else name
+        moving = float((self.observations.motion != 0).any(1).double().mean())
+        usual = USUAL_FEATURES if isinstance(self.features, Sift) else ""
+        name = self.features if isinstance(self.features, str) else usual
         if len(landmarks) > config.most:
             report(f"{len(landmarks)} landmarks found, {config.most} kept: those seen in the most images")
             landmarks = landmarks[landmarks.views.argsort(descending=True, stable=True)[: config.most].sort().values]
@@ -195,14 +190,9 @@ class TrackedViews:
         """The keypoints that were matched with keypoints of other images."""
         return self.observations[_is_tracked(self.observations)].compact()[0]
 
-    @property
-    def motion(self) -> Float[Tensor, "v 6"]:
-        """The motion of each image's camera from the first row to the last (metres, then radians)."""
-        return self.observations.motion
-
     def at(self, T_world_camera: SE3, motion: Float[Tensor, "v 6"] | None = None) -> TrackedViews:
         """Return the tracks with the images' poses (v) replaced, and also their motions (metres, then radians) if ``motion`` is given."""
-        motion = self.motion if motion is None else motion
+        motion = self.observations.motion if motion is None else motion
         images = [
             replace(p, T_ref_camera=T_world_camera[i], motion=motion[i]) for i, p in enumerate(self.observations.images)
         ]
@@ -238,18 +228,18 @@ def track_views(
     features: str | Features = USUAL_FEATURES,
     config: LandmarkConfig = DEFAULT_LANDMARKS,
     known: Callable[[Sequence[ImageKeypoints]], list[tuple[int, int, PairMatches]]] = lambda images: [],
+    labels: Int[Tensor, "m"] | None = None,
 ) -> TrackedViews:
     """Detect the keypoints of ``views``, match those of likely neighbours, and join the matches into tracks.
 
-    ``known`` returns further matches of the keypoints, which take precedence over contradicting ones.
-
-    ``features`` is a detector or its name, which is stored with the landmarks so that queries use the same detector. Raises
+    ``known`` returns further matches of the keypoints, which take precedence over contradicting ones. If the ``labels`` of the
+    tracks (see ``link_tracks``) are known from an earlier call with the same views, nothing is matched. ``features`` is a detector or its name, which is stored with the landmarks so that queries use the same detector. Raises
     ``InputError`` if there are no views, for an unknown name, and for unusable keypoints.
     """
     detector = find_features(features) if isinstance(features, str) else features
     if not views:
         raise InputError("nothing to build landmarks from:", expected="at least one view")
-    pairs = likely_pairs([view.T_ref_camera for view in views], config.neighbours)
+    pairs = likely_pairs([view.T_ref_camera for view in views if labels is None], config.neighbours)
     step = _counter("landmarks", "images and pairs", len(views) + len(pairs))
     images = _map_in_threads(lambda view: image_keypoints(view, detector), views, step)
     lengths = sorted({image.keypoints.descriptors.shape[1] for image in images})
@@ -258,7 +248,11 @@ def track_views(
             f"descriptors have {enumeration([*map(str, lengths)])} channels in different images",
             expected="the same number",
         )
-    return TrackedViews(_link_keypoints(images, pairs, step, known(images)), features)
+    if labels is None:
+        return TrackedViews(_link_keypoints(images, pairs, step, known(images)), features)
+    if len(labels) != sum(len(image.keypoints) for image in images):  # the detector has changed meanwhile
+        return track_views(views, features, config, known)
+    return TrackedViews(TrackedKeypoints(images, labels.long(), torch.arange(len(labels))), features)
 
 
 def _link_keypoints(

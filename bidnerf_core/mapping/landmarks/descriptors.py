@@ -132,8 +132,7 @@ class InvertedFile:
     def __init__(self, descriptors: UInt8[Tensor, "n d"], seed: int) -> None:
         # In large maps, cells have 500 landmarks on average, since comparing more would take most of the time.
         count = round(max(math.sqrt(len(descriptors)), len(descriptors) / 500))
-        generator = torch.Generator().manual_seed(seed)
-        self._centres = k_means(descriptors, count, generator)
+        self._centres = k_means(descriptors, count, torch.Generator().manual_seed(seed))
         cell = nearest_centre(descriptors, self._centres)
         self._order = cell.argsort(stable=True)
         self._descriptors = descriptors[self._order]

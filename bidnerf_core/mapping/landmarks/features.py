@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from threading import Lock
-from typing import Annotated, ClassVar, Protocol, runtime_checkable
+from typing import Annotated, ClassVar, Protocol, cast, runtime_checkable
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Tensor
 
 from bidnerf_core.camera import AT_REST, Intrinsics, exposure_times, reduced_size
+from bidnerf_core.devices import TensorRows
 from bidnerf_core.errors import enumeration
 from bidnerf_core.frames import Frame, View, as_floats
 from bidnerf_core.geometry import SE3
@@ -30,44 +32,24 @@ FIRST_CENTRE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Keypoints:
+class Keypoints(TensorRows):
     """Keypoints of one image, the strongest first. Descriptors are compared by Euclidean distance."""
 
     pixels: Float[Tensor, "n 2"]  # (u, v), the centre of the first pixel at (0.5, 0.5)
     sizes: Float[Tensor, "n"]  # pixels: diameter of the keypoint's neighbourhood, as OpenCV defines it
     descriptors: UInt8[Tensor, "n d"]
 
-    def __len__(self) -> int:
-        return len(self.pixels)
-
-    def __getitem__(self, index: Tensor) -> Keypoints:
-        return Keypoints(self.pixels[index], self.sizes[index], self.descriptors[index])
-
 
 @runtime_checkable
 class Features(Protocol):
     """A detector that finds and describes keypoints, always with the same number of descriptor channels.
 
-    It must be safe to call from several threads at once. ``quantize`` turns float descriptors into bytes.
+    It must be safe to call from several threads at once. ``quantize`` turns float descriptors into bytes. A detector that is
+    faster when fewer keypoints are wanted may have a method ``at_most(count)``, which returns such a detector. One that also takes
+    bytes, which spares large photos a conversion to floats, has the attribute ``takes_bytes``.
     """
 
     def __call__(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints: ...
-
-
-@runtime_checkable
-class LimitedFeatures(Features, Protocol):
-    """Optional extension of ``Features``: a detector that is faster when fewer keypoints are wanted."""
-
-    def at_most(self, count: int) -> Features:
-        """Return the detector with a maximum of ``count`` keypoints."""
-        ...
-
-
-@runtime_checkable
-class ByteFeatures(Features, Protocol):
-    """Optional extension of ``Features``: a detector that also takes bytes, which spares large photos a conversion to floats."""
-
-    takes_bytes: bool
 
 
 @dataclass(frozen=True)
@@ -130,7 +112,7 @@ def detect(features: Features, rgb: Shaped[Tensor, "h w 3"]) -> Keypoints:
 
     Raises ``PluginError`` unless the detector returns ``Keypoints`` that lie inside the image.
     """
-    keypoints = features(rgb if isinstance(features, ByteFeatures) else as_floats(rgb))
+    keypoints = features(rgb if hasattr(features, "takes_bytes") else as_floats(rgb))
     who = f"detector {getattr(features, '__name__', type(features).__name__)}"
     if not isinstance(keypoints, Keypoints):
         raise PluginError(
@@ -166,7 +148,7 @@ class _Strongest:
 
 def limit_features(features: Features, count: int) -> Features:
     """Return a detector that returns at most the ``count`` strongest keypoints."""
-    return features.at_most(count) if isinstance(features, LimitedFeatures) else _Strongest(features, count)
+    return cast(Features, getattr(features, "at_most", partial(_Strongest, features))(count))
 
 
 class CachedFeatures:

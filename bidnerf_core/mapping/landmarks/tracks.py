@@ -314,8 +314,7 @@ def keypoint_depth_noise(observations: TrackedKeypoints, points: Float[Tensor, "
     known = depth > 0
     if int(known.sum()) < ENOUGH_DEPTHS:
         return UNKNOWN.noise.linear
-    errors = depth[known] / observations.sightings.in_camera(points)[known, 2] - 1
-    return max(1e-4, mad_deviation(errors))
+    return max(1e-4, mad_deviation(depth[known] / observations.sightings.in_camera(points)[known, 2] - 1))
 
 
 def depth_ratio(observations: TrackedKeypoints, points: Float[Tensor, "n 3"]) -> float | None:

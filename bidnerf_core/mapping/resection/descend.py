@@ -127,8 +127,7 @@ class Quadratic:
 
     def __call__(self, states: States) -> Normal:
         g = states.mode
-        update = self.here.T[g].update_to(states.T)
-        off = torch.cat([update, states.nuisances - self.here.nuisances[g]], -1)
+        off = torch.cat([self.here.T[g].update_to(states.T), states.nuisances - self.here.nuisances[g]], -1)
         scale = 1 / states.unit
         pull = self.gradient[g] + (self.hessian[g] @ off[..., None])[..., 0]
         cost = self.cost[g] + 0.5 * ((pull + self.gradient[g]) * off).sum(-1)

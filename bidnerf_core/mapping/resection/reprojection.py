@@ -218,18 +218,8 @@ def resections(
         correlated, focal = torch.full((b,), correlation, dtype=torch.float64), sightings.focal[own]
         # The area of a view that is 53 degrees wide; what matters is that outliers are rare.
         area = float(focal.max()) ** 2
-        term = Landmarks(
-            local[own],
-            sights,
-            valid,
-            torch.zeros_like(valid),
-            focal,
-            correlated,
-            1 / correlated,
-            area,
-            math.inf,
-        )
-        h = b * len(motions)
+        variance, h = torch.zeros_like(valid), b * len(motions)
+        term = Landmarks(local[own], sights, valid, variance, focal, correlated, 1 / correlated, area, math.inf)
         zero, mode = torch.zeros((h, N), dtype=torch.float64), torch.arange(b).repeat(len(motions))
         states = States(
             SE3(torch.eye(3, dtype=torch.float64).expand(h, 3, 3), zero[:, :3]),
@@ -244,6 +234,5 @@ def resections(
         for _ in range(3):  # each time, the noise is estimated anew
             states, _ = descend(term.with_noise(states), [term], 10)
         states = term.with_noise(states)
-        noise = states.noise.view(-1, b).amin(0).repeat(len(motions))
-        states = replace(states, noise=noise)
+        states = replace(states, noise=states.noise.view(-1, b).amin(0).repeat(len(motions)))
         yield some, *descend(states, [term.weighted_for(states[-b:])], 10)

@@ -132,8 +132,7 @@ def surface_of_points(
         raise InputError(f"no surface to bake: {len(points)} points within the bounds of the scene")
     coordinates = points.numpy()
     away, _ = cKDTree(coordinates).query(coordinates[:: max(1, len(points) // 5000)], k=2)
-    spread = float(np.median(np.asarray(away)[:, 1]))
-    finest = max(spread, VoxelGrid.filling(bounds, config.cells).cell)
+    finest = max(float(np.median(np.asarray(away)[:, 1])), VoxelGrid.filling(bounds, config.cells).cell)
     return _fuse(points, rgb, bounds, (finest, 4 * finest), [T for _, T in cameras], config)
 
 

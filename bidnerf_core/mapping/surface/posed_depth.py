@@ -36,11 +36,6 @@ class PosedDepthImage:
     full_focal: float  # pixels, before the image was subsampled
     measured: bool = False  # by a sensor: opacity is 1 where it measured, and 0 elsewhere
 
-    @property
-    def focal(self) -> float:
-        """The focal length (pixels) of the subsampled image."""
-        return mean_focal(self.intrinsics)
-
     def solid(self, opacity: float) -> Bool[Tensor, "h w"]:
         """Return a mask of the pixels that have depth and an opacity of more than ``opacity``."""
         return (self.image.opacity > opacity) & (self.image.depth > 0)
@@ -157,10 +152,8 @@ def footprint(images: Sequence[PosedDepthImage], opacity: float, subsampled: boo
 
     The pixel is one of the full resolution or, if ``subsampled``, of the images as they are here.
     """
-    sides = [
-        float(d.median()) / (posed.focal if subsampled else posed.full_focal) for posed, d in _depths(images, opacity)
-    ]
-    return _median(sides)
+    shown = [(d, mean_focal(x.intrinsics) if subsampled else x.full_focal) for x, d in _depths(images, opacity)]
+    return _median([float(depths.median()) / focal for depths, focal in shown])
 
 
 def depth_noise(
@@ -227,14 +220,12 @@ def surface_bytes(points: Float[Tensor, "p 3"], grid: VoxelGrid) -> float:
     """Return the memory (bytes) of a surface from these points (metres, world); infinite if it has too many cells."""
     if math.prod(-(-count // BLOCK_SIDE) * BLOCK_SIDE for count in grid.shape) > MOST_CELLS:
         return math.inf
-    surfels = len(grid.numbers(points).unique())
-    return SURFEL_BYTES * surfels + index_bytes(block_levels(points, grid))
+    return SURFEL_BYTES * len(grid.numbers(points).unique()) + index_bytes(block_levels(points, grid))
 
 
 def _depths(images: Sequence[PosedDepthImage], opacity: float) -> list[tuple[PosedDepthImage, Float[Tensor, "p"]]]:
     """Return the images that show a surface, with the depths (metres) of the pixels that show it."""
-    shown = [(posed, posed.image.depth[posed.solid(opacity)]) for posed in images]
-    return [(posed, depths) for posed, depths in shown if len(depths)]
+    return [(posed, d) for posed in images if len(d := posed.image.depth[posed.solid(opacity)])]
 
 
 def _median(values: Sequence[float]) -> float:

@@ -11,23 +11,20 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from bidnerf_core.devices import Resident, constant, may_wait, move_to, working_device
+from bidnerf_core.devices import Resident, TensorRows, constant, may_wait, move_to, working_device
 from bidnerf_core.fields import VoxelGrid
 from bidnerf_core.geometry import scale_point
 from bidnerf_core.mapping.surface.surfel_index import SurfelIndex, index_bytes
 
 
 @dataclass(frozen=True, eq=False)
-class Surfels:
+class Surfels(TensorRows):
     """Points of a surface with normals and colours. World frame, metres."""
 
     positions: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"]  # unit; their sign has no meaning
     rgb: Float[Tensor, "n 3"]
     rgb_gradient: Float[Tensor, "n 3 3"]  # channel by axis, per metre, within the plane
-
-    def __len__(self) -> int:
-        return len(self.positions)
 
 
 SURFEL_BYTES = 72
@@ -104,11 +101,6 @@ class SurfaceMap(Resident):
         return (SURFEL_BYTES * len(self.surfels) + index_bytes(self.index.level)) / 2**20
 
     @property
-    def stored_cells(self) -> int:
-        """Number of entries of the index: one per cell near the surface, and one per several cells far from it."""
-        return len(self.index.entries)
-
-    @property
     def cell(self) -> float:
         """Side of a cell of the grid (metres)."""
         return self.grid.cell
@@ -129,8 +121,7 @@ class SurfaceMap(Resident):
         points = self.surfels.positions.cpu().numpy()  # scipy's tree runs on the host
         neighbour = min(5, len(points))  # the point itself and its four neighbours
         away, _ = cKDTree(points).query(points[:: max(1, len(points) // 5000)], k=neighbour)
-        fourth = np.asarray(away).reshape(-1, neighbour)[:, -1]
-        return 0.7 * float(np.quantile(fourth, 0.9)) or self.cell
+        return 0.7 * float(np.quantile(np.asarray(away).reshape(-1, neighbour)[:, -1], 0.9)) or self.cell
 
     @cached_property
     def box(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:

@@ -98,8 +98,7 @@ class SurfelIndex:
         rate = torch.eye(3) / self.grid.cell
         offset = 1 - torch.tensor(self.grid.lower, dtype=torch.float64) / self.grid.cell
         base = longest * torch.arange(3, dtype=torch.int32)[:, None]
-        tables = offset.float()[:, None], rate, torch.cat(parts).int(), base
-        return move_to(tables, self.entries.device)
+        return move_to((offset.float()[:, None], rate, torch.cat(parts).int(), base), self.entries.device)
 
     @cached_property
     def _blocks(self) -> tuple[Int[Tensor, "b"], Int[Tensor, "b"]]:

@@ -19,9 +19,9 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SceneBounds
-from bidnerf_core.geometry import SE3, look_at
+from bidnerf_core.geometry import SE3, look_at, sphere
 from bidnerf_core.mapping import SurfaceMap, surface_of_points
-from bidnerf_core.maps import MapInfo, sphere
+from bidnerf_core.maps import MapInfo
 from bidnerf_scan import meshing, read_scan
 from bidnerf_scan.meshing import Mesh, mesh_of_surface
 
