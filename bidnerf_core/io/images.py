@@ -30,8 +30,8 @@ ImageSource: TypeAlias = Path | PackedFile
 """An image file, or an image inside an archive."""
 
 LARGEST_IMAGE = 178_000_000
-"""Largest number of pixels: the most that Pillow opens, and more than the 108 megapixels of phones. A small file can describe
-an image of any size, so the size is checked before memory is allocated."""
+"""Largest number of pixels, the most that Pillow opens: a small file can describe an image of any size, so the size is checked
+before memory is allocated."""
 STRIP = 2**21
 """Number of pixels converted at a time: conversion takes many times as much memory as the image's bytes."""
 FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "AVIF", "HEIF")
@@ -277,7 +277,7 @@ def open_image(path: ImageSource) -> Iterator[Image.Image]:
     """Open an image file; its pixels are decoded on first use, within the context.
 
     Raises ``InputError`` if there is no such regular file, if it is not readable as an image, and if the
-    image has more than ``LARGEST_IMAGE`` pixels according to its header, before memory is allocated.
+    image has more pixels than Pillow opens according to its header, before memory is allocated.
     """
     raw = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
     if isinstance(path, Path) and path.suffix.lower() in raw:
@@ -297,18 +297,22 @@ def open_image(path: ImageSource) -> Iterator[Image.Image]:
             from PIL import AvifImagePlugin  # noqa: F401
         try:
             with Image.open(file, formats=[name for name in FORMATS if name in Image.OPEN]) as image:
-                if image.width * image.height > LARGEST_IMAGE:
-                    size = f"{image.width}x{image.height}, {image.width * image.height / 1e6:.0f} megapixels"
-                    raise _too_large(path, size)
                 yield image
         except InputError:
             raise
         except Image.DecompressionBombError as error:
-            raise _too_large(path, f"more than {LARGEST_IMAGE // 10**6} megapixels") from error
+            raise InputError(
+                f"image has {' '.join(re.findall(r'[0-9]+ pixels', str(error))[:1])}",
+                where=path,
+                expected=f"at most {LARGEST_IMAGE // 10**6} megapixels; scale it down",
+            ) from error
         except Exception as error:  # decoders may raise anything, even SyntaxError
             why = reason(error)
             if isinstance(error, UnidentifiedImageError):  # its text has the repr of the open file
+                file.seek(0)
+                is_tiff = file.read(4) in (b"II*\0", b"MM\0*")
                 why = f"its content is in none of the formats {', '.join(FORMATS)}"
+                why = "a TIFF file whose bands are not those of grey or colour images" if is_tiff else why
             if file.seek(0, os.SEEK_END) == 0:
                 why = "the file is empty"
             raise InputError(
@@ -338,10 +342,6 @@ def _check_segments(path: ImageSource, file: BinaryIO) -> None:
             )
         length = content[marker.end() : marker.end() + 2]
         at = marker.end() + (0 if code == b"\xd8" else max(2, int.from_bytes(length, "big")))
-
-
-def _too_large(path: ImageSource, size: str) -> InputError:
-    return InputError(f"image is {size}", where=path, expected=f"at most {LARGEST_IMAGE // 10**6} megapixels")
 
 
 def is_heif(head: bytes) -> bool:

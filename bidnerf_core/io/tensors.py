@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import os
@@ -13,7 +12,7 @@ import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -23,13 +22,12 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.io.allowance import Allowance
 from bidnerf_core.io.archives import Archive
 from bidnerf_core.io.files import open_binary, reason
 
 _Part = TypeVar("_Part")
 
-LARGEST_ARRAY = 800_000_000
-"""Largest size of an array (bytes): an image of 100 megapixels in double precision."""
 TENSOR_FILE = "a safetensors file"
 
 
@@ -38,28 +36,11 @@ def read_array(path: Path, expected: str) -> np.ndarray:
 
     ``expected`` briefly describes what the file should be.
     """
-    with open_binary(path, expected) as file:
-        try:
-            return _array(file, os.fstat(file.fileno()).st_size)
-        except Exception as error:  # NumPy parses the header as Python, which may raise anything
-            raise InputError(f"not readable as an array ({reason(error)})", where=path, expected=expected) from error
-
-
-def _array(file: BinaryIO | io.BytesIO, size: int) -> np.ndarray:
-    """Read an array from a file of ``size`` bytes. Raises ``ValueError``, or ``OSError`` from NumPy."""
-    version = np.lib.format.read_magic(file)
-    if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"version {version} of the format")
-    shape, _, kind = (
-        np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    )(file)
-    if kind.hasobject:
-        raise ValueError("objects of Python")
-    needed, left = math.prod(shape) * kind.itemsize, size - file.tell()
-    if min(shape, default=0) < 0 or needed > min(left, LARGEST_ARRAY):
-        raise ValueError(f"an array of {needed:,} bytes in {left:,}".replace(",", " "))
-    file.seek(0)
-    return np.asarray(np.load(file, allow_pickle=False))
+    open_binary(path, expected).close()
+    try:
+        return np.array(np.lib.format.open_memmap(path, mode="r"))  # a mapping reaches no farther than the file
+    except Exception as error:  # NumPy parses the header as Python, which may raise anything
+        raise InputError(f"not readable as an array ({reason(error)})", where=path, expected=expected) from error
 
 
 def read_tensors(path: Path, expected: str = TENSOR_FILE) -> dict[str, Tensor]:
@@ -166,12 +147,11 @@ def read_saved(path: Path, expected: str, mapped: bool = False) -> Any:
     ``expected`` briefly describes what the file should be. With ``mapped``, tensors stay in the file until they are used, so that
     a file of any size is recognised quickly; files in the format of torch before version 1.6, which are not zip archives,
     cannot be mapped and are read. Raises a one-line ``InputError`` if the file is missing or damaged, would run code, or unpacks to
-    more than its own size. Unless ``mapped``, a tensor whose storage is smaller than its shape (stride 0) is rejected as well.
+    more than its own size, or if its tensors, which may share numbers, take too much memory (see ``Allowance``; not if ``mapped``).
     """
     open_binary(path, expected).close()  # errors here concern opening the file; all later ones concern its content
-    size = path.stat().st_size
     archive = Archive(path, expected) if zipfile.is_zipfile(path) else None
-    if archive is not None and archive.unpacked_size > size:
+    if archive is not None and archive.unpacked_size > path.stat().st_size:
         raise InputError(
             f"unpacks to {archive.unpacked_size / 2**20:,.0f} MiB",
             where=path,
@@ -189,19 +169,13 @@ def read_saved(path: Path, expected: str, mapped: bool = False) -> Any:
             where=path,
             expected=expected,
         ) from error
+    allowance = Allowance.of(path, expected)
     try:
-        tensors = [leaf for leaf in tree_leaves(content) if isinstance(leaf, Tensor)]
+        for leaf in tree_leaves(content):
+            if isinstance(leaf, Tensor) and not mapped:  # those that stay in the file take no memory
+                allowance.take(leaf.numel() * leaf.element_size())
     except RecursionError as error:
         raise InputError(
             "contains itself, or too many parts within each other;", where=path, expected=expected
         ) from error
-    for tensor in () if mapped else tensors:  # those that stay in the file take no memory
-        needed = tensor.numel() * tensor.element_size()
-        stored = tensor.untyped_storage().nbytes() if tensor.layout is torch.strided else 0
-        if needed > min(stored, size):
-            raise InputError(
-                f"a tensor {tuple(tensor.shape)} needs {needed:,} bytes, but the file has only {size:,};",
-                where=path,
-                expected=expected,
-            )
     return content

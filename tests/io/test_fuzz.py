@@ -258,8 +258,7 @@ def test_what_is_no_file_of_a_usable_size_is_refused_before_it_is_read(kind: str
     ],
 )
 def test_arrays_are_judged_by_their_header(kind: str, shape: str, tmp_path: Path) -> None:
-    content = array_file(kind, shape)
-    (tmp_path / "a.npy").write_bytes(content)
+    (tmp_path / "a.npy").write_bytes(array_file(kind, shape))
     with pytest.raises(InputError, match="not readable as an array"):
         read_array(tmp_path / "a.npy", "a .npy file")
 

@@ -45,8 +45,7 @@ def test_an_element_without_properties_holds_nothing(tmp_path: Path, form: str) 
 @pytest.mark.parametrize("count", ["3", "9" * 18, "9" * 4000])
 @pytest.mark.parametrize("lists", [[], ["property list uchar int vertex_indices"]])
 def test_more_elements_than_the_file_has_room_for_are_refused(tmp_path: Path, count: str, lists: list[str]) -> None:
-    lines = [f"element vertex {count}", *XYZ, *lists]
-    path = ply(tmp_path / "a.ply", *lines, content=POINTS.tobytes())
+    path = ply(tmp_path / "a.ply", *[f"element vertex {count}", *XYZ, *lists], content=POINTS.tobytes())
     with refused(where=path, found="is the file truncated?"):
         read_ply(path)
 
