@@ -13,7 +13,7 @@ from contextvars import ContextVar
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from threading import Lock
-from typing import Any, TypeVar, cast
+from typing import Any, Self, TypeVar, cast
 
 import torch
 from jaxtyping import Shaped
@@ -273,7 +273,22 @@ def _rebuild(value: Any, tensors: Iterator[Tensor]) -> Any:
     return _map_parts(value, lambda part: next(tensors) if isinstance(part, Tensor) else part(), (weakref.ref,))
 
 
-# Moving objects that hold tensors to a device.
+# Objects that hold tensors.
+
+
+class TensorRows:
+    """Base class of dataclasses whose fields are tensors with a common first axis, which is indexed and has a length."""
+
+    def __len__(self) -> int:
+        return len(next(iter(vars(self).values())))
+
+    def __getitem__(self, index: Tensor | slice | None) -> Self:
+        """Select rows by an index along the first axis or by a mask; None adds an axis of length 1."""
+        return self.map(lambda part: part[index])
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Self:
+        """Return the object with ``change`` applied to each tensor."""
+        return type(self)(*(change(part) for part in vars(self).values()))
 
 
 def working_device(device: torch.device | str) -> torch.device:

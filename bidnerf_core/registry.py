@@ -136,11 +136,6 @@ def register(group: str, name: str, value: Any, replace: bool = False) -> None:
     registered[group, name] = value
 
 
-def registered_names() -> list[tuple[str, str]]:
-    """Return the group and name of every object passed to ``register`` in this process."""
-    return list(registered)
-
-
 def require_registered(names: Iterable[tuple[str, str]]) -> None:
     """Raise ``PluginError`` unless this process has registered the plugins that another process has registered.
 

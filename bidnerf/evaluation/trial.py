@@ -35,7 +35,7 @@ from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import from_plain, to_plain
 from bidnerf_core.localization import Localizer
 from bidnerf_core.maps import DESCRIPTION, Map, ViewSource, load_map
-from bidnerf_core.registry import registered_names, require_registered
+from bidnerf_core.registry import registered, require_registered
 from bidnerf_core.settings import to_flat
 
 Rows: TypeAlias = tuple[tuple[float, ...], ...]
@@ -165,7 +165,7 @@ def registered_for(trial: Trial) -> list[tuple[str, str]]:
     """
     named = {("methods", trial.method), *(("faults", fault.name) for fault in parse_faults(trial.fault))}
     needed = ("backends", "features", "readers")
-    return [key for key in registered_names() if key in named or key[0] in needed]
+    return [key for key in list(registered) if key in named or key[0] in needed]
 
 
 def trial_views(trial: Trial, dataset: Capture) -> list[View]:

@@ -55,9 +55,8 @@ class StoredCamera:
 
     def scaled(self, factor: float) -> StoredCamera:
         """Return the camera with all lengths (positions and motion) multiplied by ``factor``."""
-        motion = self.motion and (*scale_point(self.motion[:3], factor), *self.motion[3:])
         scaled = self._map_poses(lambda rows: (*((a, b, c, t * factor) for a, b, c, t in rows[:3]), rows[3]))
-        return replace(scaled, motion=motion)
+        return replace(scaled, motion=self.motion and (*scale_point(self.motion[:3], factor), *self.motion[3:]))
 
     def _map_poses(self, change: Callable[[MatrixRows], MatrixRows]) -> StoredCamera:
         given = self.given_T_world_camera
@@ -148,11 +147,8 @@ def refinement_updates(cameras: Sequence[StoredCamera]) -> list[Float[Tensor, "6
     """Return the right updates (metres, then radians) from given to refined poses; None for unrefined poses."""
     if not cameras:
         return []
-    given = _pose([camera.given_T_world_camera or camera.T_world_camera for camera in cameras])
-    updates = (given.inverse() @ poses_of(cameras)).log()
-    return [
-        None if camera.given_T_world_camera is None else update for camera, update in zip(cameras, updates, strict=True)
-    ]
+    updates = (poses_of(given_cameras(cameras)).inverse() @ poses_of(cameras)).log()
+    return [update if camera.given_T_world_camera else None for camera, update in zip(cameras, updates, strict=True)]
 
 
 def moved_cameras(cameras: Sequence[StoredCamera]) -> list[MovedCamera]:
@@ -251,8 +247,7 @@ def cameras_beside(path: Path, placement: Similarity) -> tuple[StoredCamera, ...
 
     Returns no cameras if there is no such file. A damaged file, or one in another layout, is ignored with an ``InputWarning``.
     """
-    folders = [path.parent, *list(path.parent.parents)[:2]]
-    file = next((folder / INRIA_CAMERAS for folder in folders if (folder / INRIA_CAMERAS).is_file()), None)
+    file = next((f for folder in path.parents[:3] if (f := folder / INRIA_CAMERAS).is_file()), None)
     if file is None:
         return ()
     cameras = list[StoredCamera]()

@@ -315,8 +315,7 @@ def _of_quaternions() -> Iterator[Reading]:
         return T.inverse() if of_inverse != then_invert else T
 
     orders = (([3, 0, 1, 2], "x y z w", "w x y z"), ([1, 2, 3, 0], "w x y z", "x y z w"))
-    both = (False, True)
-    for (order, given, expected), of_inverse, then_invert in itertools.product(orders, both, both):
+    for (order, given, expected), of_inverse, then_invert in itertools.product(orders, (False, True), (False, True)):
         also = ", and the poses are inverses (world to camera)" if then_invert else ""
         yield from _in_file_axes(
             f"their quaternions are in the order {given}, but {expected} is expected{also}",
@@ -340,10 +339,12 @@ def _of_positions() -> Iterator[Reading]:
     """Yield readings in which positions use different axes from rotations."""
     for D in (*signed_permutations(-1), *signed_permutations(1)[1:]):
         order = ", ".join(("-" if row.sum() < 0 else "") + "xyz"[int(row.abs().argmax())] for row in D)
-        clause = f"x, y and z of their positions are the given ones' {order}"
-        remedy = "correct the fourth column of each, not the rotations"
         for axes, also, swap in ((AS_GIVEN, "", ""), (Y_AND_Z_REVERSED, REVERSED_TOO, f", and {SWAP}")):
-            yield Reading(clause + also, remedy + swap, partial(reinterpret, axes=axes, positions=D))
+            yield Reading(
+                f"x, y and z of their positions are the given ones' {order}{also}",
+                f"correct the fourth column of each, not the rotations{swap}",
+                partial(reinterpret, axes=axes, positions=D),
+            )
 
 
 def _of_orders(count: int) -> Iterator[Reading]:
@@ -392,8 +393,8 @@ def _in_file_axes(clause: str, remedy: str, understand: Callable[[SE3], SE3]) ->
 
 def signed_permutations(determinant: int) -> list[Float[Tensor, "3 3"]]:
     """Return the 24 signed permutation matrices with a determinant of 1 or -1, starting with the identity if it is among them."""
-    orders, signs = itertools.permutations(range(3)), list(itertools.product((1.0, -1.0), repeat=3))
-    candidates = (AS_GIVEN[list(order)] * torch.tensor([s]).mT for order in orders for s in signs)
+    orders = itertools.product(itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3))
+    candidates = (AS_GIVEN[list(order)] * torch.tensor([signs]).mT for order, signs in orders)
     return [A for A in candidates if round(float(torch.linalg.det(A))) == determinant]
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from bidnerf_core.camera import STILL, MotionPrior
@@ -98,7 +98,7 @@ def prepare_views(
         return TrainingViews(seeing, tracked, stored_cameras(views), distances=shows_distances(views, tracked))
     tracked = _track(views, features, trust_poses, depth_unit)
     fit = training_poses(tracked, views, 0.0 if refinement == "always" else INCONSISTENT)
-    poses, motion = fit.tracked.T_world_camera, fit.tracked.motion
+    poses, motion = fit.tracked.T_world_camera, fit.tracked.observations.motion
     moved = list(views)
     if fit.refined or fit.replaced:
         moved = [replace(view, T_ref_camera=poses[i]) for i, view in enumerate(views)]
@@ -127,15 +127,16 @@ def track_landmarks(
     features: str = USUAL_FEATURES,
     trust_poses: bool = False,
     depth_unit: float | None = None,
+    labels: Int[Tensor, "m"] | None = None,
 ) -> tuple[TrackedViews | None, list[View]]:
-    """Track the keypoints of the views, unless all have dense depth or a silhouette.
+    """Track the keypoints of the views, unless all have dense depth or a silhouette; with known ``labels``, without matching.
 
     Returns the tracks (None if none are needed), from which baking builds the map's landmarks, and the views with
     the landmarks visible in each, which provide distances for training.
     """
     if not any(map(_lacks_distances, views)):
         return None, list(views)
-    tracked = _track(views, features, trust_poses, depth_unit)
+    tracked = _track(views, features, trust_poses, depth_unit, labels)
     return tracked, _with_landmarks(views, tracked)
 
 
@@ -144,12 +145,18 @@ def _lacks_distances(view: View) -> bool:
     return not (view.frame.has_dense_depth or has_outline(view))
 
 
-def _track(views: Sequence[View], features: str, trust_poses: bool, depth_unit: float | None) -> TrackedViews:
+def _track(
+    views: Sequence[View],
+    features: str,
+    trust_poses: bool,
+    depth_unit: float | None,
+    labels: Int[Tensor, "m"] | None = None,
+) -> TrackedViews:
     """Track the keypoints of the views. Raises ``InputError`` if poses contradict the images or depth is in another unit.
 
     The unit is checked last, since triangulated distances are meaningless under wrong poses.
     """
-    tracked = track_views(views, features)
+    tracked = track_views(views, features, labels=labels)
     counter("checking poses", "stage")(0, 1)
     if not trust_poses:
         _check_poses(tracked.observations.images)
@@ -270,7 +277,7 @@ def adjust_poses(
         return None
     deviations, motion = _deviations(torch.stack(updates)), STILL
     for number in range(ROUNDS):
-        start = Adjustment(tracked.T_world_camera, points, tracked.motion)
+        start = Adjustment(tracked.T_world_camera, points, tracked.observations.motion)
         prior = PosePrior(given, *deviations, motion)
         fit = adjust_bundle(seen.sightings, start, prior, noise_of(seen, points), KEYPOINTS_PER_INDEPENDENT)
         step = _image_motion(seen, fit.points, tracked.T_world_camera, fit.T_world_camera)
@@ -328,6 +335,5 @@ def common_motion(seen: TrackedKeypoints, points: Float[Tensor, "n 3"], correlat
     total, some = 0.0, numbers[:: -(-len(numbers) // 60)]
     for _, states, normal in resections(sightings, points, some, correlation, (STILL, prior)):
         still, moving = log_evidence(states, normal).view(2, -1)
-        gain = (moving - still).clamp(-MOST_EVIDENCE, MOST_EVIDENCE)
-        total += float(gain.nan_to_num(-MOST_EVIDENCE).sum())
+        total += float((moving - still).clamp(-MOST_EVIDENCE, MOST_EVIDENCE).nan_to_num(-MOST_EVIDENCE).sum())
     return prior if total > 0 else STILL

@@ -45,10 +45,8 @@ def rays_of(
 
 def has_outline(view: View) -> bool:
     """Return whether the image shows background; an alpha channel that is 1 everywhere carries no information."""
-    frame = view.frame
-    return frame.alpha is not None and bool(
-        (frame.alpha if frame.hidden is None else frame.alpha[~frame.hidden]).amin() <= 0
-    )
+    alpha, hidden = view.frame.alpha, view.frame.hidden
+    return alpha is not None and bool((alpha if hidden is None else alpha[~hidden]).amin() <= 0)
 
 
 def carve_box(box: AxisBox, views: Sequence[View]) -> AxisBox:
@@ -58,8 +56,13 @@ def carve_box(box: AxisBox, views: Sequence[View]) -> AxisBox:
     the box still meets 99.9 % of the rays to pixels with matter. It removes peripheral cells, which so few views see that hardly any could
     have emptied them. Each of three rounds carves the box that the previous round found.
     """
-    side = 64
-    origins, directions = _rays_to_matter(views)
+    side, origins, directions = 64, [], []  # of rays (world) through a sample of the pixels whose alpha is over a half
+    for view in views:
+        alpha, hidden = view.frame.alpha, view.frame.hidden
+        assert alpha is not None  # every view has an outline
+        ray, _ = rays_of(view, alpha > 0.5 if hidden is None else (alpha > 0.5) & ~hidden, 500)
+        directions.append(view.T_ref_camera.to(torch.float64).rotate(ray))
+        origins.append(view.T_ref_camera.translation.double().expand_as(ray))
     for _ in range(3):
         lower, upper = box
         cell = (upper - lower) / side
@@ -71,29 +74,16 @@ def carve_box(box: AxisBox, views: Sequence[View]) -> AxisBox:
         for share in (0.5, 0.25, 0.1, 0.0):
             cells = occupied[witnesses >= share * witnesses.amax()]
             box = grow(lower + cells.amin(dim=0) * cell, lower + (cells.amax(dim=0) + 1) * cell)
-            near, far = intersect_box(origins, directions, *box)
+            near, far = intersect_box(torch.cat(origins), torch.cat(directions), *box)
             if (far >= near.clamp(min=0)).double().mean() >= 0.999:
                 break
     return box
 
 
-def _rays_to_matter(views: Sequence[View]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Return the origins and directions (world) of rays through a sample of the pixels whose alpha is over a half."""
-    origins, directions = [], []
-    for view in views:
-        alpha, hidden = view.frame.alpha, view.frame.hidden
-        assert alpha is not None  # every view has an outline
-        ray, _ = rays_of(view, alpha > 0.5 if hidden is None else (alpha > 0.5) & ~hidden, 500)
-        directions.append(view.T_ref_camera.to(torch.float64).rotate(ray))
-        origins.append(view.T_ref_camera.translation.double().expand_as(ray))
-    return torch.cat(origins), torch.cat(directions)
-
-
 def _shows_something(view: View, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
     """Return whether a view shows matter (alpha over 0) at each point (metres, world)."""
     camera, alpha, hidden = view.frame.intrinsics, view.frame.alpha, view.frame.hidden
-    seen = view.T_ref_camera.to(torch.float64).inverse().apply(points).float()
-    row, column, inside = camera.cells(seen)
+    row, column, inside = camera.cells(view.T_ref_camera.to(torch.float64).inverse().apply(points).float())
     inside = inside if hidden is None else inside & ~hidden[row, column]
     return inside if alpha is None else inside & (alpha[row, column] > 0)
 
@@ -199,8 +189,7 @@ def _guessed_box(views: Sequence[View], centres: Float[Tensor, "v 3"]) -> AxisBo
         if (distance < ahead * tangents).double().mean() >= 0.8:
             half = (torch.linalg.vector_norm(centres - middle, dim=-1) * tangents).amax()
             return middle - half, middle + half
-    extent = (centres.amax(dim=0) - centres.amin(dim=0)).amax()
-    reach = 4 * (float(extent) or 1.0)
+    reach = 4 * (float((centres.amax(dim=0) - centres.amin(dim=0)).amax()) or 1.0)
     poses = [view.T_ref_camera.to(torch.float64) for view in views]
     points = torch.cat([centres, *(T.apply(rays * reach) for T, rays in zip(poses, corners, strict=True))])
     return points.amin(dim=0), points.amax(dim=0)

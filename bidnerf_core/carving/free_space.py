@@ -21,7 +21,7 @@ from torch.nn import functional
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.devices import move_to, threads_at_most
 from bidnerf_core.fields import VoxelGrid
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.frames import View
 
 CPU = torch.device("cpu")
 RAY_BLOCK = 8
@@ -48,7 +48,13 @@ class FreeSpace:
         suffices for coarse cells and bounds the time. ``tolerance`` is the relative error of measured depth, and ``footprint`` the highest
         level.
         """
-        free, camera = _free_depth(view.frame, tolerance), view.frame.intrinsics
+        frame, camera = view.frame, view.frame.intrinsics
+        # The planar z (metres) up to which space is free at each pixel: infinite for background, 0 where nothing is known
+        free = torch.zeros(frame.rgb_bytes.shape[:2]) if frame.depth is None else frame.depth.float() * (1 - tolerance)
+        if frame.alpha is not None:  # a pixel on an edge covers two depths but has one measurement
+            free = torch.where(frame.alpha >= 1, free, torch.where(frame.alpha <= 0, torch.inf, 0.0))
+        if frame.hidden is not None:
+            free = torch.where(frame.hidden, 0.0, free)
         height, width = free.shape
         factor = math.ceil(max(free.shape) / 400)
         padded = functional.pad(free, (0, -width % factor, 0, -height % factor))
@@ -74,8 +80,7 @@ class FreeSpace:
         known &= (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
         # Integers in floats are exact, since these are below 2^24.
         index = (pixels * height + rows) * width + columns
-        least = self.levels.flatten()[torch.where(known, index, 0).long()]
-        return known & (deepest < least)
+        return known & (deepest < self.levels.flatten()[torch.where(known, index, 0).long()])
 
     def _footprint(self, points: Float[Tensor, "3 n"], radius: float) -> tuple[Tensor, Tensor, Tensor]:
         """Return the column, row and radius, in whole pixels, of each sphere's image; the radius is infinite for spheres out of view."""
@@ -95,18 +100,6 @@ class FreeSpace:
         u, v = camera.project(points.T).floor().unbind(-1)
         # Distortion enlarges the footprint a little; outside the image, its polynomial may fold back into the image.
         return u, v, torch.where((self.edges @ points > 0).all(dim=0), (pixels * 1.25).ceil(), torch.inf)
-
-
-def _free_depth(frame: Frame, tolerance: float) -> Float[Tensor, "h w"]:
-    """Return the planar z (metres) up to which space is free at each pixel: infinite for background, 0 where nothing is known."""
-    free = torch.zeros(frame.rgb_bytes.shape[:2])
-    if frame.depth is not None:
-        free = frame.depth.float() * (1 - tolerance)
-    if frame.alpha is not None:  # a pixel on an edge covers two depths but has one measurement
-        free = torch.where(frame.alpha >= 1, free, torch.where(frame.alpha <= 0, torch.inf, 0.0))
-    if frame.hidden is not None:
-        free = torch.where(frame.hidden, 0.0, free)
-    return free
 
 
 def _edges(camera: Intrinsics) -> Float[Tensor, "4 3"]:

@@ -99,16 +99,17 @@ def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> Dept
 
 def _absent(values: np.ndarray, metres: np.ndarray) -> dict[str, np.ndarray]:
     """Return masks of the values that mean "not measured", by their names in messages; the masks are disjoint."""
-    is_float = values.dtype.kind == "f"
-    largest = np.iinfo(
-        np.uint16 if is_float else values.dtype
-    ).max  # written for "too far" or "nothing", in 16 bits as a rule
-    absent = {"negative": values < 0, str(largest): values == largest}
+    is_float, finite = values.dtype.kind == "f", np.isfinite(values)
+    # written for "too far" or "nothing", in 16 bits as a rule
+    largest = np.iinfo(np.uint16 if is_float else values.dtype).max
+    absent = {"NaN": np.isnan(values), "infinite": np.isinf(values), "negative": finite & (values < 0)}
+    absent |= {str(largest): values == largest}
     if is_float:
-        finite, clipped = np.isfinite(values), largest * MILLIMETRE
-        absent = {"NaN": np.isnan(values), "infinite": np.isinf(values), "negative": finite & (values < 0)}
-        absent |= {str(largest): values == largest, f"{clipped:g}": np.abs(values - clipped) < 1e-5}
-        absent |= {f"{NOTHING:g} or more": finite & (values >= NOTHING)}
+        clipped = largest * MILLIMETRE
+        absent |= {
+            f"{clipped:g}": np.abs(values - clipped) < 1e-5,
+            f"{NOTHING:g} or more": finite & (values >= NOTHING),
+        }
     return absent | {f"over {FARTHEST:g} m": ~np.logical_or.reduce(list(absent.values())) & (metres > FARTHEST)}
 
 

@@ -13,27 +13,24 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.errors import InputError, unknown_name
+from bidnerf_core.errors import unknown_name
 from bidnerf_core.geometry import MAD_TO_SIGMA
+from bidnerf_core.settings import NotNegative, Settings
 
 Depth = TypeVar("Depth", float, Tensor)
 
 
 @dataclass(frozen=True)
-class DepthNoise:
+class DepthNoise(Settings):
     """The standard deviation of a pixel's depth as a polynomial in the depth."""
 
-    constant: float = 0.0  # metres
-    linear: float = 0.0  # metres per metre, hence independent of the unit of length
-    quadratic: float = 0.0  # metres per square metre; sensors that measure disparity have this kind of noise
-
-    def __post_init__(self) -> None:
-        if not all(0 <= value < math.inf for value in (self.constant, self.linear, self.quadratic)):
-            raise InputError(f"the depth noise is {self}", expected="finite coefficients of 0 or more")
+    constant: NotNegative = 0.0  # metres
+    linear: NotNegative = 0.0  # metres per metre, hence independent of the unit of length
+    quadratic: NotNegative = 0.0  # metres per square metre; sensors that measure disparity have this kind of noise
 
     def deviation(self, depth: Depth) -> Depth:
         """Return the standard deviation (metres) of measured depths (metres)."""
@@ -41,23 +38,16 @@ class DepthNoise:
 
 
 @dataclass(frozen=True)
-class DepthSensorModel:
+class DepthSensorModel(Settings):
     """The errors of one kind of depth sensor, as standard deviations.
 
     Only named sensors have errors in metres. For an unknown sensor, all errors are relative, since a scene may
     have any unit of length.
     """
 
-    scale: float  # relative error of the factor shared by all depths of the sensor
+    scale: NotNegative  # relative error of the factor shared by all depths of the sensor
     noise: DepthNoise
-    offset: float = 0.0  # metres, error of the constant shared by all depths of the sensor
-
-    def __post_init__(self) -> None:
-        if not all(0 <= value < math.inf for value in (self.scale, self.offset)):
-            raise InputError(
-                f"the depth sensor has scale {self.scale} and offset {self.offset}",
-                expected="finite numbers of 0 or more",
-            )
+    offset: NotNegative = 0.0  # metres, error of the constant shared by all depths of the sensor
 
 
 UNKNOWN = DepthSensorModel(scale=0.01, noise=DepthNoise(linear=0.01))
@@ -119,9 +109,16 @@ def estimate_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) ->
     """
     if min(depth.shape) < WINDOW_SIDE:
         return None
-    rows, columns = _lines_of_sensor(depth.detach().cpu())
+    depth = depth.detach().cpu()
+    # If the sensor's resolution is lower than the image's, depth was resampled by nearest neighbour: rows and columns that repeat
+    # the preceding one are no separate measurements. All count if few repeat another, such as empty ones along a border, and if
+    # hardly any would be left, as in an exact image of a wall.
+    first = torch.ones(1, dtype=torch.bool)
+    rows, columns = (torch.cat([first, (x[1:] != x[:-1]).any(-1)]) for x in (depth, depth.T))
+    if not all(LEAST_VALUES <= int(new.sum()) <= 0.8 * len(new) for new in (rows, columns)):
+        rows[:], columns[:] = True, True
     image = intrinsics.unproject(intrinsics.pixel_centres(torch.float64)[rows][:, columns])[..., :2]
-    depth = depth.detach().cpu()[rows][:, columns].double()
+    depth = depth[rows][:, columns].double()
     # Adjacent windows, one per row; left-over rows and columns of the image are not used.
     parts = (part.unfold(0, WINDOW_SIDE, WINDOW_SIDE).unfold(1, WINDOW_SIDE, WINDOW_SIDE) for part in (depth, image))
     z, x = (part.flatten(0, 1).flatten(-2) for part in parts)
@@ -152,20 +149,6 @@ def estimate_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) ->
 
     (linear, quadratic), _ = nnls(np.stack([np.ones_like(at), at], axis=-1), deviation)
     return DepthNoise(linear=float(linear), quadratic=float(quadratic))
-
-
-def _lines_of_sensor(depth: Float[Tensor, "h w"]) -> tuple[Int[Tensor, "r"], Int[Tensor, "c"]]:
-    """Return the indices of the rows and columns that do not repeat the preceding row or column.
-
-    If the sensor's resolution is lower than the image's, depth was resampled by nearest neighbour: repeated
-    pixels are not separate measurements. All lines are returned if few of them repeat another, such as empty
-    lines along a border, and if hardly any would be left, as in an exact image of a wall.
-    """
-    first = torch.ones(1, dtype=torch.bool)
-    rows, columns = (torch.cat([first, (x[1:] != x[:-1]).any(-1)]) for x in (depth, depth.T))
-    if not all(LEAST_VALUES <= int(new.sum()) <= 0.8 * len(new) for new in (rows, columns)):
-        rows[:], columns[:] = True, True
-    return rows.nonzero()[:, 0], columns.nonzero()[:, 0]
 
 
 def describe_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics, sensor: str) -> str | None:

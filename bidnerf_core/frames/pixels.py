@@ -84,7 +84,9 @@ def draw(
     Images may be on any device; the result is on ``device``, by default that of the images.
     """
     share = max(1, count // len(views))
-    return Observations.stacked([observe(view, drawer(view.frame, share, generator), dtype, device) for view in views])
+    return Observations.joined(
+        [observe(view, drawer(view.frame, share, generator), dtype, device)[None] for view in views]
+    )
 
 
 def visible_at(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Bool[Tensor, "n"]:

@@ -49,8 +49,7 @@ def ray_termination(rendering: Rendering, batch: TrainingBatch) -> Float[Tensor,
             part.index_select(0, index) for part in (measured, distance, deviation, weights, middles, opacity)
         )
     away = (weights * expected_distance(middles - distance[:, None], deviation[:, None])).sum(-1)
-    missing = (1 - opacity) * distance
-    return torch.where(measured, away + missing, 0).sum() / measured.sum().clamp(min=1)
+    return torch.where(measured, away + (1 - opacity) * distance, 0).sum() / measured.sum().clamp(min=1)
 
 
 def expected_distance(offset: Float[Tensor, "*p"], deviation: Float[Tensor, "*#p"]) -> Float[Tensor, "*p"]:

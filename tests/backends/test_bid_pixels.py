@@ -28,8 +28,7 @@ def square() -> Frame:
 
 
 def blank() -> Frame:
-    noise = torch.randn(48, 64, 3, generator=torch.Generator().manual_seed(0)) / 255
-    return frame((0.7 + noise).clamp(0, 1))
+    return frame((0.7 + torch.randn(48, 64, 3, generator=torch.Generator().manual_seed(0)) / 255).clamp(0, 1))
 
 
 def test_the_corners_of_a_square_are_found() -> None:

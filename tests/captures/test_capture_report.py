@@ -236,8 +236,7 @@ def test_blur_in_any_direction_costs_sharpness(size: tuple[int, int], hidden: bo
         around[:30] = around[90:] = around[:, :30] = around[:, 130:] = True
         images = [np.where(around[..., None].numpy(), 2 * noise, image) for image in images]
     frames = [Frame("a", torch.from_numpy(image), CAMERA).with_hidden(around) for image in images]
-    views = [View(frame, SE3.identity()) for frame in frames]
-    before, after = photo_measures(views)[0].tolist()
+    before, after = photo_measures([View(frame, SE3.identity()) for frame in frames])[0].tolist()
     assert after < before - 0.3
 
 
@@ -283,7 +282,6 @@ def test_a_picture_is_drawn_of_cameras_gaps_and_landmarks(tmp_path: Path) -> Non
 @pytest.mark.slow
 def test_exact_poses_of_small_images_are_not_called_wrong() -> None:
     """A pose by twenty landmarks scatters more than the usual one by forty."""
-    small = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
-    images = views(demo_object(), small, orbit(3.5, 30, seed=0))
+    images = views(demo_object(), Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128), orbit(3.5, 30, seed=0))
     found = survey_capture(track_views(images), images)
     assert [photo.name for photo in found.photos if "badly posed" in photo.problems] == []

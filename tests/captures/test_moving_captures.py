@@ -98,7 +98,9 @@ def test_motions_are_estimated_and_the_poses_become_more_accurate() -> None:
     found, views, poses = corrected(1.0)
     assert found.refined
     assert require(found.consistency).noise_after == pytest.approx(NOISE, rel=0.15)
-    true, estimated, none = (last_row(poses, m) for m in (motions(1.0), found.tracked.motion, motions(0.0)))
+    true, estimated, none = (
+        last_row(poses, m) for m in (motions(1.0), found.tracked.observations.motion, motions(0.0))
+    )
     assert float((estimated - true).norm(dim=-1).median()) < 0.35 * float((true - none).norm(dim=-1).median())
     given = SE3.stack([view.T_ref_camera for view in views])
     assert float(turned(found.tracked.T_world_camera, poses).median()) < 0.5 * float(turned(given, poses).median())
@@ -108,7 +110,7 @@ def test_motions_are_noticed_though_the_poses_are_right() -> None:
     """Structure from motion gives such poses for the frames of a video; the keypoints alone contradict a camera at rest."""
     found, _, _ = corrected(1.0, pose_error=0.0)
     assert found.refined
-    assert bool((found.tracked.motion != 0).any())
+    assert bool((found.tracked.observations.motion != 0).any())
 
 
 @pytest.mark.slow
@@ -125,14 +127,13 @@ def test_wrong_intrinsics_are_no_motion(wrong: dict[str, Any], pose_error: float
     camera = replace(PINHOLE, **wrong)
     views = [replace(view, frame=replace(view.frame, intrinsics=camera)) for view in views]
     found = training_poses(track_views(views, points), views)
-    assert bool((found.tracked.motion == 0).all())
+    assert bool((found.tracked.observations.motion == 0).all())
 
 
 def test_known_motions_leave_only_the_noise_of_keypoints() -> None:
     """What is built from the same tracks, landmarks and the scatter of poses, takes the motions into account."""
     tracked, _, true = tracks(1.0)
-    known = tracked.at(true, motions(1.0))
-    seen, positions = known.triangulate(LandmarkConfig())
+    seen, positions = tracked.at(true, motions(1.0)).triangulate(LandmarkConfig())
     blind, elsewhere = tracked.triangulate(LandmarkConfig())
     off, before = (
         torch.stack([update[3:].norm() for update in pose_updates(*pair).values()]).median()
@@ -146,13 +147,13 @@ def test_views_with_a_motion_are_tracked_with_it() -> None:
     points, views, _ = moving(1.0)
     moved = motions(1.0)[:4]
     known = [replace(view, motion=motion) for view, motion in zip(views[:4], moved, strict=True)]
-    assert torch.equal(track_views(known, points).motion, moved)
+    assert torch.equal(track_views(known, points).observations.motion, moved)
 
 
 @pytest.mark.slow
 def test_the_motion_is_stored_with_the_pose() -> None:
     found, views, _ = corrected(1.0)
-    poses, moved = found.tracked.T_world_camera, found.tracked.motion
+    poses, moved = found.tracked.T_world_camera, found.tracked.observations.motion
     trained = [replace(v, T_ref_camera=poses[i], motion=moved[i]) for i, v in enumerate(views)]
     cameras = record_refinement(views, stored_cameras(trained), found.pixels.tolist())
     again = apply_stored_poses(views, cameras)

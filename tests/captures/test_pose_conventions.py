@@ -28,8 +28,7 @@ CYCLED = torch.tensor([[0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
 
 def images(points: Points, poses: list[SE3]) -> list[ImageKeypoints]:
     """The keypoints of a ring of cameras, with other ``poses`` than the true ones."""
-    views = ring(points, len(poses))
-    found = detect_keypoints(views, points)
+    found = detect_keypoints(ring(points, len(poses)), points)
     return [replace(image, T_ref_camera=T) for image, T in zip(found, poses, strict=True)]
 
 
@@ -98,8 +97,7 @@ def test_right_poses_before_a_wall_are_not_refused() -> None:
     points.positions[:, 2] = 0
     places = [-2 + 0.3 * i for i in range(IMAGES)]
     poses = [looking_at([x, -0.3, -3.0], [0.5 * x + 1, 0.0, 0.0]) for x in places]
-    views = [points.view(T, seed=i) for i, T in enumerate(poses)]
-    seen = detect_keypoints(views, points)
+    seen = detect_keypoints([points.view(T, seed=i) for i, T in enumerate(poses)], points)
     assert pose_contradiction(seen) is None
     given = [with_axes(T, REVERSED) for T in poses]
     found = pose_contradiction([replace(p, T_ref_camera=T) for p, T in zip(seen, given, strict=True)])
@@ -117,8 +115,7 @@ def test_pure_rotation_and_pure_translation_are_not_refused() -> None:
 
 def test_images_that_share_nothing_tell_nothing() -> None:
     generator = torch.Generator().manual_seed(0)
-    points = Points(COUNT)
-    found = images(points, [with_axes(T, REVERSED) for T in true_poses()])
+    found = images(Points(COUNT), [with_axes(T, REVERSED) for T in true_poses()])
     for image in found:
         image.keypoints.descriptors.random_(0, 256, generator=generator)
     assert pose_contradiction(found) is None
@@ -184,8 +181,7 @@ def test_mistakes_are_refused_with_the_remedy_that_works(mistake: str) -> None:
 
 def irregular_poses(count: int = IMAGES) -> list[SE3]:
     """Cameras that look at the points from places on no ring, so that no two mistakes look alike."""
-    generator = torch.Generator().manual_seed(4)
-    shifts = 0.25 * torch.randn(count, 6, dtype=torch.float64, generator=generator)
+    shifts = 0.25 * torch.randn(count, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
     shifts[:, 3:] *= 0.3
     return [looking_in(0.12 * i, 0.15 * (-1) ** i) @ SE3.exp(shifts[i]) for i in range(count)]
 
@@ -207,8 +203,7 @@ def test_images_in_no_order_are_judged_as_well() -> None:
     points = Points(COUNT, 0.4, 0.1)
     poses = [view.T_ref_camera for view in ring(points, 40)]
     order = torch.randperm(40, generator=torch.Generator().manual_seed(1)).tolist()
-    views = [points.view(poses[i], seed=i) for i in order]
-    found = detect_keypoints(views, points)
+    found = detect_keypoints([points.view(poses[i], seed=i) for i in order], points)
     assert pose_contradiction(found) is None
     mixed = [replace(image, T_ref_camera=found[(7 * i) % 40].T_ref_camera) for i, image in enumerate(found)]
     contradiction = require(pose_contradiction(mixed))

@@ -128,8 +128,7 @@ def test_nothing_in_common_leaves_the_poses_alone() -> None:
 def test_poses_that_are_not_refined_are_checked_by_at_most_sixty_views(
     count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    camera = Intrinsics(4.0, 4.0, 2.0, 1.5, 4, 3)
-    frame = Frame("a", torch.zeros(3, 4, 3), camera, torch.ones(3, 4))
+    frame = Frame("a", torch.zeros(3, 4, 3), Intrinsics(4.0, 4.0, 2.0, 1.5, 4, 3), torch.ones(3, 4))
     checked = list[View]()
     module = "bidnerf_core.captures.training_views"
     monkeypatch.setattr(f"{module}.detect_keypoints", lambda views, _: checked.extend(views) or [])
@@ -179,8 +178,7 @@ def test_poses_of_motion_capture_are_refined_and_those_of_a_renderer_are_not(
 ) -> None:
     dataset = open_dataset(data_dir / scene)
     views = dataset.views("train", dataset.frame_names("train")[:12])
-    features = Sift(count=300)
-    found = training_poses(track_views(views, features), views)
+    found = training_poses(track_views(views, Sift(count=300)), views)
     assert found.refined == refined
     assert found.consistency is not None
     if refined:

@@ -119,8 +119,7 @@ def test_no_matter_is_cut_away_and_most_air_is(depth: bool, alpha: bool, camera:
 
 def test_a_wall_of_depth_empties_what_is_before_it() -> None:
     """A view from the side, a wall at z = 3: cells nearer are free but for the margin, those behind are not known."""
-    depth = torch.full((48, 64), 3.0)
-    view = View(Frame("wall", torch.zeros(48, 64, 3), CAMERA, depth), SE3.identity())
+    view = View(Frame("wall", torch.zeros(48, 64, 3), CAMERA, torch.full((48, 64), 3.0)), SE3.identity())
     shape = (2, 2, 40)
     occupied = occupied_cells([view], (-0.2, -0.2, 0.0), (0.2, 0.2, 4.0), shape, tolerance=0.02, footprint=16)
     z = (torch.arange(40) + 0.5) / 10
@@ -230,8 +229,7 @@ def holds(bounds: SceneBounds, points: Float[Tensor, "n 3"]) -> float:
 
 @pytest.mark.parametrize(("depth", "alpha"), [(True, True), (False, True), (True, False), (False, False)])
 def test_the_box_holds_the_ball(depth: bool, alpha: bool) -> None:
-    views = ball_views(depth=depth, alpha=alpha)
-    bounds = estimate_bounds(views, (0.1, 0.2, 0.3))
+    bounds = estimate_bounds(ball_views(depth=depth, alpha=alpha), (0.1, 0.2, 0.3))
     ends = torch.tensor(BALL).double() + RADIUS * 0.97 * torch.cat([torch.eye(3), -torch.eye(3)]).double()
     assert holds(bounds, ends) == 1
     assert bounds.background == (0.1, 0.2, 0.3)

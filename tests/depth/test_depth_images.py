@@ -34,8 +34,7 @@ LARGEST_FLOAT = float(np.finfo(np.float32).max)
 )
 @pytest.mark.parametrize("kind", ["float32", "float64"])
 def test_floats_that_stand_for_nothing(value: float, name: str, kind: str) -> None:
-    raw = np.array([[1.5, 2.5], [value, 0.0]], dtype=kind)
-    found = depth_image(raw, 1.0, "depth")
+    found = depth_image(np.array([[1.5, 2.5], [value, 0.0]], dtype=kind), 1.0, "depth")
     assert found.metres.tolist() == [[1.5, 2.5], [0, 0]]
     assert found.replaced == {name: 1}
     assert found.notice(unit_assumed=False) == f"treated as not measured: 1 x {name}"
@@ -89,8 +88,7 @@ def test_files_of_every_kind_agree(tmp_path: Path) -> None:
 
 def filled(limit: float, kind: str = "uint16", share: float = 0.3) -> np.ndarray:
     """Depth from 500 to 3499 steps, with ``limit`` in a share of the pixels."""
-    generator = np.random.default_rng(1)
-    raw = generator.integers(500, 3500, (40, 50)).astype(kind)
+    raw = np.random.default_rng(1).integers(500, 3500, (40, 50)).astype(kind)
     raw.flat[: round(share * raw.size)] = limit
     return raw
 

@@ -72,8 +72,7 @@ def test_rounding_on_slanted_walls_counts_once() -> None:
 
 def test_gross_errors_and_edges_do_not_count_as_noise(generator: Generator) -> None:
     depth = noisy(corridor(), lambda z: 0.005 * z, generator)
-    wrong = torch.rand(depth.shape, generator=generator) < 0.02
-    depth = torch.where(wrong, depth * 1.05, depth)
+    depth = torch.where(torch.rand(depth.shape, generator=generator) < 0.02, depth * 1.05, depth)
     depth[60:120, 100:180] *= 0.7
     assert relative(estimate_depth_noise(depth, CAMERA), 2.0) == pytest.approx(0.005, rel=0.3)
 
@@ -84,8 +83,7 @@ def test_depth_of_a_lower_resolution_than_its_image_has_the_noise_of_its_own_pix
 ) -> None:
     own = noisy(corridor(), lambda z: 0.01 * z, generator)
     rows, columns = ((torch.arange(n) + 0.5) * m / n for n, m in zip(size[::-1], own.shape, strict=True))
-    resampled = own[rows.long()][:, columns.long()]
-    found = estimate_depth_noise(resampled, Intrinsics.from_hfov(60.0, *size))
+    found = estimate_depth_noise(own[rows.long()][:, columns.long()], Intrinsics.from_hfov(60.0, *size))
     assert relative(found, 2.0) == pytest.approx(0.01, rel=0.2)
 
 

@@ -91,8 +91,7 @@ def test_what_was_not_measured_stays_empty() -> None:
     measured = seen(DEPTH, SE3.identity())
     measured[50:62, 110:126] = 0
     found = SENSOR.register(measured, COLOUR, "depth")
-    whole = SENSOR.register(seen(DEPTH, SE3.identity()), COLOUR, "depth")
-    changed = found != whole
+    changed = found != SENSOR.register(seen(DEPTH, SE3.identity()), COLOUR, "depth")
     assert bool((found[changed] == 0).all())
     scale = COLOUR.fx / DEPTH.fx
     assert int(changed.sum()) == pytest.approx(12 * 16 * scale**2, rel=0.15)
@@ -131,8 +130,7 @@ def test_a_folder_of_images_is_registered_from_a_file(tmp_path: Path) -> None:
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
     """A recording in the layout of TUM RGB-D whose depth is not registered."""
-    depth = seen(DEPTH, SE3.identity())
-    frame = Frame("a", torch.zeros(120, 160, 3), COLOUR, depth)
+    frame = Frame("a", torch.zeros(120, 160, 3), COLOUR, seen(DEPTH, SE3.identity()))
     frames = [Recorded(10.0 + number / 10, View(frame, SE3.identity())) for number in range(3)]
     return write_recording(tmp_path / "freiburg2_recording", frames)
 
@@ -143,8 +141,7 @@ def first(path: Path, **options: object) -> TimedFrame:
 
 def test_a_recording_like_tums_is_registered_from_a_sensor(recording: Path, tmp_path: Path) -> None:
     stored = require(first(recording, camera=COLOUR).frame.depth)
-    sensor = write_sensor(tmp_path / "sensor.json")
-    found = first(recording, camera=COLOUR, register_depth=str(sensor))
+    found = first(recording, camera=COLOUR, register_depth=str(write_sensor(tmp_path / "sensor.json")))
     torch.testing.assert_close(found.frame.depth, SENSOR.register(stored, COLOUR, "depth"))
     (view,) = open_dataset(recording, camera=COLOUR, register_depth=SENSOR).views("test")
     assert torch.equal(view.frame.depth, require(found.frame.depth))  # type: ignore[arg-type]

@@ -218,8 +218,7 @@ def drawn(view: View, name: DrawerName) -> torch.Tensor:
 
 
 def batch(view: View) -> torch.Tensor:
-    bank = RayBank([view], demo_object().bounds)
-    return bank.draw(2000, torch.Generator().manual_seed(0)).observed.rgb
+    return RayBank([view], demo_object().bounds).draw(2000, torch.Generator().manual_seed(0)).observed.rgb
 
 
 def free(view: View) -> torch.Tensor:
@@ -269,8 +268,7 @@ def test_one_visible_pixel_is_enough_for_rays() -> None:
 
 
 def test_no_keypoint_reaches_into_what_is_hidden() -> None:
-    generator = torch.Generator().manual_seed(0)
-    coarse = torch.rand(1, 3, 30, 40, generator=generator)
+    coarse = torch.rand(1, 3, 30, 40, generator=torch.Generator().manual_seed(0))
     rgb = torch.nn.functional.interpolate(coarse, (120, 160), mode="bicubic")[0].movedim(0, -1).clamp(0, 1)
     (like,) = views(1)
     camera = replace(like.frame.intrinsics, width=160, height=120, cx=80.0, cy=60.0)

@@ -34,8 +34,7 @@ def photo(tmp_path: Path) -> Path:
 def stored(monkeypatch: pytest.MonkeyPatch, landmarks: LandmarkMap | None) -> None:
     """Let the command load the textured ground with these landmarks, whatever the folder."""
     known, info = textured_map(surface=True), MapInfo("ground", {}, BOUNDS, 1, True, "data", weights="ground")
-    ground = Map(info, known.field, known.surface, landmarks)
-    open_map(monkeypatch, ground)
+    open_map(monkeypatch, Map(info, known.field, known.surface, landmarks))
 
 
 def landmarks_of(*cameras: Intrinsics) -> LandmarkMap:

@@ -48,8 +48,7 @@ def byte_frame(seed: int = 0, camera: Intrinsics = CAMERA) -> Frame:
 
 
 def some_views(count: int, camera: Intrinsics = CAMERA) -> list[View]:
-    generator = torch.Generator().manual_seed(1)
-    twists = 0.1 * torch.randn(count, 6, generator=generator, dtype=torch.float64)
+    twists = 0.1 * torch.randn(count, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     return [View(byte_frame(i, camera), SE3.exp(twists[i])) for i in range(count)]
 
 

@@ -74,8 +74,7 @@ def test_every_backend_weighs_blurred_photos_less(name: str) -> None:
         settings = replace(config, steps=1, carve=False, **changes)  # type: ignore[type-var]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
-            field = backend.build(settings, BOUNDS)
-            backend.train(field, photos(blur), settings, report)
+            backend.train(backend.build(settings, BOUNDS), photos(blur), settings, report)
         return report.loss
 
     assert first_loss(3.0) < 0.99 * first_loss(3.0, sharpness=False)

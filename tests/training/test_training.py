@@ -318,8 +318,7 @@ def test_where_few_pixels_have_depth_a_share_of_the_rays_goes_through_them() -> 
     few = [replace(v, frame=replace(v.frame, depth=torch.zeros_like(v.frame.depth))) for v in views]  # type: ignore[arg-type]
     for number in (0, 1, 4):
         few[number].frame.depth[3, 2] = 1.0 + number  # type: ignore[index]
-    bank = RayBank(few, BOUNDS)
-    batch = bank.draw(400, torch.Generator().manual_seed(0))
+    batch = RayBank(few, BOUNDS).draw(400, torch.Generator().manual_seed(0))
     measured = batch.observed.distance > 0
     assert float(measured.float().mean()) == pytest.approx(MEASURED_SHARE, abs=0.05)
     assert len(batch.observed.distance[measured].unique()) == 3

@@ -15,7 +15,7 @@ import torch
 import tiny
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.devices import move_to
-from bidnerf_core.fields import RaySamples, query_packed, query_samples
+from bidnerf_core.fields import RaySamples, query_samples
 from bidnerf_core.frames import View
 from bidnerf_core.training import RayBank, TrainingStopped, ray_bank
 
@@ -147,7 +147,7 @@ def test_packed_samples_have_the_values_of_the_others(room: int, generator: torc
     rays = RayBank(VIEWS, BOUNDS).draw(12, generator).rays
     borders = torch.linspace(2, 4, 9).expand(12, -1)
     samples = RaySamples(borders[:, :-1], borders[:, 1:], torch.rand((12, 8), generator=generator) < 0.5)
-    expected, (values, kept) = query_samples(field, rays, samples), query_packed(field, rays, samples, room)
+    expected, (values, kept) = query_samples(field, rays, samples), recipe.query_packed(field, rays, samples, room)
     assert int(kept.valid.sum()) == min(room, int(samples.valid.sum()))
     assert torch.equal(
         kept.valid.reshape(-1), samples.valid.reshape(-1) & (samples.valid.reshape(-1).cumsum(0) <= room)
