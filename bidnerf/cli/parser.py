@@ -29,7 +29,7 @@ from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
 from bidnerf.cli.program import option_name
 from bidnerf_core.errors import InputError, UsageError, enumeration, spelled, spelling_hint
-from bidnerf_core.registry import list_plugins, registered_names
+from bidnerf_core.registry import list_plugins, registered
 from bidnerf_core.settings import Allowed, Expert, OneOf
 
 T = TypeVar("T")
@@ -313,7 +313,7 @@ class _Parser(argparse.ArgumentParser):
         """
         groups, packages, fields = ("backends", "methods", "importers"), {"bidnerf_core"}, set[str]()
         unknown, known = self.unknown_option(words), self._option_string_actions
-        if unknown is None or any(group in groups for group, _ in registered_names()):
+        if unknown is None or any(group in groups for group, _ in registered):
             return unknown is not None
         packages |= {re.split("[.:]", info.value)[0] for group in groups for info in list_plugins(group)}
         for spec in filter(None, map(find_spec, packages)):
