@@ -63,7 +63,7 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
             raise record.error("has no pose", expected="rotation and translation of 3 numbers each")
         rotation = torch.from_numpy(Rotation.from_rotvec(turn).as_matrix())
         T_world_camera = SE3(rotation, torch.tensor(position, dtype=torch.float64)).inverse()
-        # 0 where a photo does not record it
+        # The time is 0 where a photo does not record it.
         return Shot(
             image=image, camera=known[key], T_world_camera=T_world_camera, time=record.number("capture_time") or None
         )

@@ -16,7 +16,7 @@ import tiny
 from bidnerf.scenes import orbit
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.carving import estimate_bounds
-from bidnerf_core.datasets import SparseChoice, SparsePoints, read_model
+from bidnerf_core.datasets import SparseChoice, SparsePoints, read_model, read_posed_images
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from optional import require
@@ -94,13 +94,13 @@ def test_an_image_that_observes_nothing_and_names_with_blanks(tmp_path: Path) ->
 def test_every_truncation_of_a_binary_model_is_refused(model: Path) -> None:
     pytest.importorskip("pycolmap")
     sparse_model.to_binary(model)
-    for name in ("images.bin", "points3D.bin"):
+    for name, read in (("images.bin", read_model), ("points3D.bin", read_model), ("cameras.bin", read_posed_images)):
         file = model / name
         whole = file.read_bytes()
         for length in {*range(24), *range(0, len(whole), 53), len(whole) - 1}:
             file.write_bytes(whole[:length])
             with refused(where=file) as caught:
-                read_model(model)
+                read(model)
             told = rf"too early, at byte {length};|declares \d+ entries in {length - 8} bytes"
             assert re.search(told, caught.error.found)
         file.write_bytes(whole)

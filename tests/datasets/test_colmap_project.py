@@ -172,14 +172,6 @@ def test_images_reduced_after_the_reconstruction(project: Path) -> None:
         assert timed.frame.intrinsics.fx in (10.0, 9.5)
 
 
-def test_every_truncation_of_binary_cameras_is_refused(project: Path) -> None:
-    file = to_binary(project / "sparse/0") / "cameras.bin"
-    whole = file.read_bytes()
-    for length in {*range(0, 24, 2), *range(0, len(whole), 29), len(whole) - 1}:
-        file.write_bytes(whole[:length])
-        assert "cameras.bin" in message(project, open_dataset)
-
-
 def test_a_binary_camera_that_is_not_perspective(project: Path) -> None:
     file = to_binary(project / "sparse/0") / "cameras.bin"
     content = bytearray(file.read_bytes())

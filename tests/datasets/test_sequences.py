@@ -130,19 +130,6 @@ def test_image_names_may_be_times(tmp_path: Path) -> None:
     assert [timed.time for timed in open_sequence(tmp_path, focal=8)] == [2.125, 2.25, 12.9]
 
 
-def test_places_without_a_sequence(tmp_path: Path) -> None:
-    with refused(where=tmp_path / "gone", found="no such file or folder"):
-        open_sequence(tmp_path / "gone")
-    with refused(where=tmp_path, found="no images in it", expected="image files or a dataset"):
-        open_sequence(tmp_path)
-    (tmp_path / "notes.txt").write_text("x")
-    with refused(where=tmp_path / "notes.txt", found="is a file", expected="the folder of a dataset, or a video (.mp4"):
-        open_sequence(tmp_path / "notes.txt")
-    write_transforms(tmp_path, {"train": tiny.views(1)})
-    with refused(where=tmp_path, found="a dataset with its own cameras; leave out `camera`"):
-        open_sequence(tmp_path, camera=tiny.CAMERA)
-
-
 @pytest.mark.data
 def test_a_recorded_sequence_is_one_video(data_dir: Path) -> None:
     """Train and test together are every fourth frame of a video at 30 Hz, in which the camera does not jump."""

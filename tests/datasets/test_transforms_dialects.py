@@ -166,24 +166,6 @@ def test_a_unit_of_length_that_is_none_is_ignored(capture: Path, unit: object) -
     assert open_dataset(capture).unit == usual
 
 
-@pytest.mark.filterwarnings("ignore::bidnerf_core.errors.InputWarning")
-def test_missing_images_are_left_out_and_counted(capture: Path) -> None:
-    for number in (2, 3, 4):
-        (capture / f"images/r_{number}.png").unlink()
-    (capture / "depth/r_6.png").unlink()
-    images, depth = sorted(remarks_of(capture), key=lambda text: "depth" in text)
-    assert "3 of 10 images are missing and left out" in images
-    assert images.endswith("first: images/r_2.png")
-    assert "1 of 7 depth images is missing and left out, first: depth/r_6.png" in depth
-    views = read_all(capture)
-    assert sorted(views) == [f"r_{number}" for number in (0, 1, 5, 6, 7, 8, 9)]
-    assert [name for name, view in views.items() if view.frame.depth is None] == ["r_6"]
-    for file in (capture / "images").iterdir():
-        file.unlink()
-    with refused(where=capture / "images/r_0.png", found="no such image"):
-        read_all(capture)
-
-
 def test_lists_of_names_that_no_frame_has(capture: Path) -> None:
     listed = ["images/r_1.png", "images/nix.png", "images\\r_2.png", 7]
     edit_keys(capture / "transforms.json", train_filenames=listed)

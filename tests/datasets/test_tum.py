@@ -73,33 +73,34 @@ def test_the_name_of_a_sensor_says_the_camera(name: str, sensor: str, folder: Pa
     assert next(iter(open_sequence(renamed))).frame.intrinsics == expected
 
 
-def test_frames_without_truth_are_in_the_sequence_alone(folder: Path) -> None:
-    """The ground truth begins with the second frame and has a gap of 0.16 s around the sixth to ninth."""
-    edit_rows(folder / "groundtruth.txt", lambda rows: rows[2:10] + rows[18:])
-    dataset = open_dataset(folder)
-    assert sum(len(dataset.frame_names(split)) for split in dataset.splits) == 5
-    truths = [timed.truth for timed in open_sequence(folder)]
-    assert [place for place, truth in enumerate(truths) if truth is None] == [0, 5, 6, 7, 8]
-    (folder / "groundtruth.txt").unlink()
-    assert all(timed.truth is None and timed.split is None for timed in open_sequence(folder))
+def first_depth(offset: float, name: str = "", rest: int = 1) -> Callable[[list[str]], list[str]]:
+    """Return an edit that moves the first depth image in time or, with a name, adds another one before it."""
+
+    def edit(rows: list[str]) -> list[str]:
+        time, own = rows[0].split()
+        return [f"{float(time) + offset:.6f} {name or own}", *rows[rest:]]
+
+    return edit
 
 
-def test_depth_that_is_late_belongs_to_no_image(folder: Path) -> None:
-    edit_rows(
-        folder / "depth.txt",
-        lambda rows: [f"{float(rows[0].split()[0]) + 0.0165:.6f} {rows[0].split()[1]}", *rows[1:]],
-    )
-    assert [timed.frame.depth is None for timed in open_sequence(folder)] == [True] + [False] * 9
-    (folder / "depth.txt").unlink()
-    assert all(timed.frame.depth is None for timed in open_sequence(folder))
-
-
-def test_the_next_depth_image_takes_the_place_of_a_missing_one(folder: Path) -> None:
-    edit_rows(
-        folder / "depth.txt",
-        lambda rows: [f"{float(rows[0].split()[0]) - 0.001:.6f} depth/gone.png", *rows],
-    )
-    assert [timed.frame.depth is None for timed in open_sequence(folder)] == [False] * 10
+@pytest.mark.parametrize(
+    ("file", "change", "without_truth", "without_depth"),
+    [
+        ("groundtruth.txt", lambda rows: rows[2:10] + rows[18:], [0, 5, 6, 7, 8], []),  # a gap of 0.16 s
+        ("groundtruth.txt", None, range(10), []),
+        ("depth.txt", first_depth(0.0165), [], [0]),  # too late for its image
+        ("depth.txt", None, [], range(10)),
+        ("depth.txt", first_depth(-0.001, "depth/gone.png", 0), [], []),  # the next one takes its place
+    ],
+)
+def test_images_have_the_truth_and_the_depth_of_their_times(
+    file: str, change: Callable[[list[str]], list[str]] | None, without_truth: Any, without_depth: Any, folder: Path
+) -> None:
+    (folder / file).unlink() if change is None else edit_rows(folder / file, change)
+    frames = list(open_sequence(folder))
+    assert [place for place, timed in enumerate(frames) if timed.truth is None] == list(without_truth)
+    assert [place for place, timed in enumerate(frames) if timed.frame.depth is None] == list(without_depth)
+    assert all((timed.split is None) == (timed.truth is None) for timed in frames)
 
 
 def test_lists_may_be_in_any_order_and_end_as_on_windows(folder: Path) -> None:
@@ -111,32 +112,6 @@ def test_lists_may_be_in_any_order_and_end_as_on_windows(folder: Path) -> None:
     for timed, (time, name, truth) in zip(open_sequence(folder), expected, strict=True):
         assert (timed.time, timed.frame.name) == (time, name)
         torch.testing.assert_close(require(timed.truth).matrix(), require(truth).matrix())
-
-
-def test_a_recording_that_was_copied_in_part(folder: Path) -> None:
-    """Six of ten images are there, and the last row of the ground truth is cut off."""
-    expected = [timed.truth for timed in open_sequence(folder)]
-    for kind, kept in (("rgb", 6), ("depth", 5)):
-        for file in sorted((folder / kind).iterdir())[kept:]:
-            file.unlink()
-    edit_rows(folder / "groundtruth.txt", lambda rows: [*rows[:-1], rows[-1][: rows[-1].index(" ") + 6]])
-    said = remarks_of(folder)
-    for remark in (
-        "4 of 10 images are missing and left out, first: rgb/",
-        "5 of 10 depth images are missing and left out",
-        "the last row is truncated (2 of 8 entries)",
-    ):
-        assert sum(remark in text for text in said) == 1
-    assert len(said) == 3
-    frames = list(open_sequence(folder))
-    assert [timed.frame.depth is not None for timed in frames] == [True] * 5 + [False]
-    for timed, truth in zip(frames, expected, strict=False):
-        torch.testing.assert_close(require(timed.truth).matrix(), require(truth).matrix())
-    for file in (folder / "rgb").iterdir():
-        file.unlink()
-    image = folder / "rgb/1305031102.175304.png"
-    with refused(where=image, found="no such image, although"):
-        open_dataset(folder)
 
 
 def test_names_with_blanks_and_windows_separators(folder: Path) -> None:

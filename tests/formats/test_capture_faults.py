@@ -25,6 +25,7 @@ from bidnerf_core.errors import InputWarning
 from refusals import refused
 from scan_layouts import (
     LAYOUTS,
+    SMALL,
     edit_frame,
     edit_keys,
     every_frame,
@@ -313,17 +314,22 @@ def test_a_folder_that_is_no_dataset(tmp_path: Path) -> None:
     (tmp_path / "pi.h264").write_bytes(b"\0\0\0\1")
     for name in ("empty", "notes"):
         (tmp_path / name).mkdir()
-    (tmp_path / "notes/notes.txt").touch()
-    for name, found, expected in (
-        ("none", "no such folder", "a dataset"),
-        (f"sound/{JSON}", f"is a file of a dataset; give its folder, {folder}", None),
-        ("scan.zip", "is an archive", "the folder of a dataset; unpack the archive first"),
-        ("pi.h264", "is a video in a container that is not read", "MP4"),
-        ("empty", "the folder is empty", "photos or a dataset in one of"),
-        ("notes", "contains no photos and is no dataset", "photos or a dataset in one of"),
+    for name in ("notes/notes.txt", "notes.txt"):
+        (tmp_path / name).touch()
+    for name, read, found, expected in (
+        ("none", read_all, "no such folder", "a dataset"),
+        ("none", open_sequence, "no such file or folder", "a dataset, images or a video"),
+        (f"sound/{JSON}", read_all, f"is a file of a dataset; give its folder, {folder}", None),
+        ("scan.zip", read_all, "is an archive", "the folder of a dataset; unpack the archive first"),
+        ("notes.txt", open_sequence, "is a file", "the folder of a dataset, or a video (.mp4"),
+        ("pi.h264", read_all, "is a video in a container that is not read", "MP4"),
+        ("empty", read_all, "the folder is empty", "photos or a dataset in one of"),
+        ("empty", open_sequence, "no images in it", "image files or a dataset"),
+        ("notes", read_all, "contains no photos and is no dataset", "photos or a dataset in one of"),
+        ("sound", partial(open_sequence, camera=SMALL), "a dataset with its own cameras; leave out `camera`", None),
     ):
         with refused(where=tmp_path / name, found=found, expected=expected) as caught:
-            read_all(tmp_path / name)
+            read(tmp_path / name)
         assert caught.error.where == str(tmp_path / name)
         assert expected is not None or caught.error.expected is None
         assert len(f"{caught.error.found}{caught.error.expected}".replace(str(tmp_path), "")) < 300

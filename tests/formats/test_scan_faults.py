@@ -74,6 +74,14 @@ def zero_pose(root: Path) -> None:
     )
 
 
+def copied_in_part(root: Path) -> None:
+    """Four of six images are there, three of their depth images, and the last row of the ground truth is cut off."""
+    for kind, kept in (("rgb", 4), ("depth", 3)):
+        for file in sorted((root / kind).iterdir())[kept:]:
+            file.unlink()
+    edit_rows(root / "groundtruth.txt", lambda rows: [*rows[:-1], rows[-1][: rows[-1].index(" ") + 6]])
+
+
 def missing_and_uncalibrated(root: Path) -> None:
     (root / "images/IMG_2.png").unlink()
     file = root / "cameras.xml"
@@ -81,7 +89,29 @@ def missing_and_uncalibrated(root: Path) -> None:
 
 
 INCOMPLETE: dict[str, tuple[Callable[[Path], object], int, list[int], list[int], list[str]]] = {
-    # What happens to six frames; how many a sequence has then, which of them have no pose and no depth; the remarks.
+    # The layout, perhaps with a note after a semicolon; what happens to six frames; how many a sequence has then, which of them
+    # have no pose and no depth; the remarks.
+    "transforms": (
+        unlinked("images/r_2.png", "depth/r_5.png"),
+        5,
+        [],
+        [4],
+        [
+            "1 of 6 images is missing and left out, first: images/r_2.png",
+            "1 of 5 depth images is missing and left out, first: depth/r_5.png",
+        ],
+    ),
+    "tum; copied in part": (
+        copied_in_part,
+        4,
+        [],
+        [3],
+        [
+            "2 of 6 images are missing and left out, first: rgb/",
+            "3 of 6 depth images are missing and left out",
+            "the last row is truncated (2 of 8 entries)",
+        ],
+    ),
     "record3d, unpacked": (
         lost_pose,
         5,
@@ -159,7 +189,8 @@ INCOMPLETE: dict[str, tuple[Callable[[Path], object], int, list[int], list[int],
 @pytest.mark.parametrize("kind", INCOMPLETE)
 def test_what_is_missing_is_left_out_and_counted(kind: str, tmp_path: Path) -> None:
     edit, count, without_pose, without_depth, expected = INCOMPLETE[kind]
-    folder, options = LAYOUTS[kind].write(tmp_path, small_views(6)), LAYOUTS[kind].options
+    layout = LAYOUTS[kind.partition(";")[0]]
+    folder, options = layout.write(tmp_path, small_views(6)), layout.options
     edit(tmp_path)
     said = remarks_of(folder, **options)
     assert len(said) == len(expected)
