@@ -46,80 +46,106 @@ def find_camera(raster: Raster, exif: Exif, **given: Any) -> ResolvedCamera:
 # EXIF.
 
 
-def test_an_equivalent_focal_length_refers_to_the_diagonal() -> None:
-    """The diagonal of the image subtends the angle that 43.27 mm subtend at that focal length."""
-    source = find_camera(PHOTO, Exif(equivalent_mm=26))
-    camera = source.intrinsics
-    half = math.atan(math.hypot(camera.width, camera.height) / 2 / camera.fx)
-    assert half == pytest.approx(math.atan(math.hypot(36, 24) / 2 / 26))
-    assert (camera.cx, camera.cy, camera.fx) == (2016, 1512, camera.fy)
-    assert source.description == (
-        "26 mm equivalent in EXIF: fx 3029 px at 4032x3024 (the principal point is assumed to be the image centre)"
-    )
+F26 = math.hypot(*SIZE) / math.hypot(36, 24) * 26  # pixels: the equivalent focal length refers to the diagonal
+SMALL, WIDE = (Intrinsics.from_focal(f, 400, 300) for f in (300, 500))
+FILM = Intrinsics.from_focal(90, 320, 180)
+PHONE, PIXELS = Exif(equivalent_mm=26), Exif(size=SIZE, focal_mm=4.0, pixels_per_mm=(700.0, 700.0))
+TAKEN = replace(PHONE, size=SIZE)
+FOUND: dict[str, tuple[Raster, Exif, list[Intrinsics], Intrinsics, str]] = {
+    # The image, its tags, and the assumed cameras; the camera that is found, and a part of its description.
+    "equivalent": (
+        PHOTO,
+        PHONE,
+        [],
+        Intrinsics.from_focal(F26, *SIZE),
+        "26 mm equivalent in EXIF: fx 3029 px at 4032x3024 (the principal point is assumed to be the image centre)",
+    ),
+    "equivalent, though a camera is assumed": (PHOTO, PHONE, [SMALL], Intrinsics.from_focal(F26, *SIZE), "in EXIF"),
+    "portrait": (PORTRAIT, PHONE, [], Intrinsics.from_focal(F26, *SIZE[::-1]), "in EXIF"),
+    "pixels of the sensor": (PHOTO, PIXELS, [], Intrinsics.from_focal(2800, *SIZE), "4 mm, pixel size in EXIF"),
+    "reduced since": (Raster(2016, 1512), PIXELS, [], Intrinsics.from_focal(1400, 2016, 1512), "in EXIF"),
+    "zoomed": (
+        PHOTO,
+        replace(PIXELS, digital_zoom=2.0),
+        [],
+        Intrinsics.from_focal(5600, *SIZE),
+        "pixel size and digital zoom 2 in EXIF",
+    ),
+    "turned tags": (PHOTO, replace(PHONE, size=SIZE[::-1]), [], Intrinsics.from_focal(F26, *SIZE), "in EXIF"),
+    **{
+        f"median of the same shape, {raster.orientation}": (
+            raster,
+            Exif(),
+            [WIDE, FILM, SMALL, SMALL],
+            Intrinsics.from_focal(300 * 4032 / 400, *raster.upright_size),
+            "assumed to be that of the map's images",
+        )
+        for raster in (PHOTO, PORTRAIT)
+    },
+    "exactly this size comes first": (
+        Raster(400, 300),
+        Exif(),
+        [WIDE, replace(SMALL, width=800, height=600), WIDE],
+        WIDE,
+        "assumed",
+    ),
+    "a centre crop": (
+        Raster(250, 250),
+        Exif(),
+        [SMALL],
+        Intrinsics.from_focal(300 * 250 / 300, 250, 250),
+        "assumed to be that of centre crops of the map's images",
+    ),
+    **{
+        f"{what} of {exif.equivalent_mm} mm": (
+            Raster(*size),
+            exif,
+            [SMALL],
+            Intrinsics.from_focal(factor * focal, *size),
+            "; cropped from a photo of 4032x3024",
+        )
+        for exif, focal in ((TAKEN, F26), (replace(PIXELS, digital_zoom=2.0), 5600.0))
+        for what, size, factor in (
+            ("cropped", (1200, 3000), 1),
+            ("cropped and resized", (1080, 1080), 1080 / 3024),
+            ("cropped and enlarged", (8064, 4536), 2),
+        )
+    },
+}
 
 
-def test_a_focal_length_and_the_pixels_of_the_sensor() -> None:
-    taken = Exif(size=SIZE, focal_mm=4.0, pixels_per_mm=(700.0, 700.0))
-    assert found(taken).fx == pytest.approx(2800)
-    assert found(taken, Raster(2016, 1512, UPRIGHT)).fx == pytest.approx(1400)  # was reduced since
-    zoomed = Exif(size=SIZE, focal_mm=4.0, pixels_per_mm=(700.0, 700.0), digital_zoom=2.0)
-    assert found(zoomed).fx == pytest.approx(5600)
-    assert "digital zoom 2" in find_camera(PHOTO, zoomed).description
-
-
-def test_a_portrait_photo_is_as_wide_as_it_was_high() -> None:
-    camera = found(Exif(equivalent_mm=26), PORTRAIT)
-    assert (camera.width, camera.height, camera.cx) == (3024, 4032, 1512)
-    assert camera.fx == found(Exif(equivalent_mm=26)).fx
-
-
-def test_a_photo_that_was_cropped_since_is_refused() -> None:
-    for taken in (SIZE, SIZE[::-1]):
-        assert found(Exif(size=taken, equivalent_mm=26)).fx > 0
-    with refused(where="a.jpg", found=f"4032x3024, but was 4032x2268 when EXIF was written; give its camera: {WAYS}"):
-        found(Exif(size=(4032, 2268), equivalent_mm=26))
-
-
-@pytest.mark.parametrize("exif", [Exif(), Exif(focal_mm=4.2), Exif(pixels_per_mm=(700.0, 700.0))])
-def test_without_a_focal_length_the_ways_to_give_one_are_named(exif: Exif) -> None:
-    with refused(where="a.jpg", found="no focal length in EXIF", expected=f"a camera: {WAYS}"):
-        found(exif)
-
-
-def test_without_a_focal_length_the_median_of_images_of_the_same_shape_is_assumed() -> None:
-    small, wide = (Intrinsics.from_focal(f, 400, 300) for f in (300, 500))
-    film = Intrinsics.from_focal(90, 320, 180)
-    for raster in (PHOTO, PORTRAIT):
-        source = find_camera(raster, Exif(), assumed=[wide, film, small, small])
-        assert source.approximate
-        assert source.intrinsics == Intrinsics.from_focal(300 * 4032 / 400, *raster.upright_size)
-        assert "assumed to be that of the map's images" in source.description
-    same = find_camera(Raster(400, 300), Exif(), assumed=[wide, replace(small, width=800, height=600), wide])
-    assert same.intrinsics == wide  # images of exactly this size come before others of the same shape
-    square = find_camera(Raster(250, 250, UPRIGHT), Exif(), assumed=[small])
-    assert square.intrinsics == Intrinsics.from_focal(300 * 250 / 300, 250, 250)
-    assert "assumed to be that of centre crops of the map's images" in square.description
-    tagged = Exif(equivalent_mm=26)
-    assert find_camera(PHOTO, tagged, assumed=[small]).intrinsics == found(tagged)
-    assert not find_camera(PHOTO, Exif(), focal=3000, assumed=[small]).approximate
+@pytest.mark.parametrize("kind", FOUND)
+def test_the_camera_of_exif_or_the_one_that_is_assumed(kind: str) -> None:
+    raster, exif, assumed, expected, description = FOUND[kind]
+    source = find_camera(raster, exif, assumed=assumed)
+    torch.testing.assert_close(source.intrinsics.matrix(), expected.matrix())
+    assert (source.intrinsics.width, source.intrinsics.height) == (expected.width, expected.height)
+    assert source.approximate
+    assert description in source.description
+    assert not find_camera(raster, exif, focal=3000, assumed=assumed).approximate
 
 
 @pytest.mark.parametrize(
-    "exif", [Exif(equivalent_mm=26), Exif(focal_mm=4.2, pixels_per_mm=(700.0, 700.0), digital_zoom=2.0)]
+    ("raster", "exif", "message", "expected"),
+    [
+        *(
+            (raster, replace(PHONE, size=size), f"{sizes} when EXIF was written; give its camera: {WAYS}", None)
+            for raster, size, sizes in (
+                (PHOTO, (4032, 2268), "4032x3024, but was 4032x2268"),
+                (Raster(1200, 3000), SIZE, "1200x3000, but was 4032x3024"),
+            )
+        ),
+        *(
+            (PHOTO, exif, "no focal length in EXIF", f"a camera: {WAYS}")
+            for exif in (Exif(), Exif(focal_mm=4.2), Exif(pixels_per_mm=(700.0, 700.0)))
+        ),
+    ],
 )
-def test_a_cropped_photo_has_the_focal_length_of_the_whole_one_where_it_is_estimated(exif: Exif) -> None:
-    whole, part = replace(exif, size=SIZE), Raster(1200, 3000, UPRIGHT)
-    assumed = [Intrinsics.from_focal(300, 400, 300)]
-    source = find_camera(part, whole, assumed=assumed)
-    assert source.approximate
-    assert source.intrinsics == Intrinsics.from_focal(found(exif).fx, 1200, 3000)
-    assert source.description.endswith("cropped from a photo of 4032x3024")
-    square = find_camera(Raster(1080, 1080, UPRIGHT), whole, assumed=assumed)  # resized as well
-    assert square.intrinsics.fx == pytest.approx(found(exif).fx * 1080 / 3024)
-    large = find_camera(Raster(8064, 4536, UPRIGHT), whole, assumed=assumed)
-    assert large.intrinsics.fx == pytest.approx(found(exif).fx * 2)
-    with refused(found="1200x3000, but was 4032x3024"):
-        find_camera(part, whole)
+def test_without_a_focal_length_or_cropped_since_the_ways_to_give_a_camera_are_named(
+    raster: Raster, exif: Exif, message: str, expected: str | None
+) -> None:
+    with refused(where="a.jpg", found=message, expected=expected):
+        found(exif, raster)
 
 
 def test_tags_are_read_from_the_file(tmp_path: Path) -> None:
