@@ -60,16 +60,16 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
 
 def _calibration(file: Path, camera: str, size: tuple[int, int]) -> tuple[Intrinsics, SE3]:
     """Return a camera and its pose in camera 0's frame. Raises ``InputError`` if the file lacks the camera."""
-    for row in read_rows(file, "KITTI's calib.txt", "P0: 12 numbers"):
-        name, _, text = row.text.partition(":")
-        if name.strip() == camera:
-            projection = torch.tensor(row.numbers(text.split(), 12), dtype=torch.float64).reshape(3, 4)
-            if not abs(float(torch.linalg.det(projection[:, :3]))) > 0:
-                raise row.error(": the matrix projects no image")
-            shift = torch.linalg.solve(projection[:, :3], projection[:, 3])
-            numbers = [float(projection[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
-            return camera_of(row.where, numbers, size), SE3(torch.eye(3, dtype=torch.float64), -shift)
-    raise InputError(f"has no row {camera}", where=file, expected="the projection matrix of the images")
+    rows = {row.text.partition(":")[0].strip(): row for row in read_rows(file, "KITTI's calib.txt", "P0: 12 numbers")}
+    if camera not in rows:
+        raise InputError(f"has no row {camera}", where=file, expected="the projection matrix of the images")
+    row = rows[camera]
+    projection = torch.tensor(row.numbers(row.text.partition(":")[2].split(), 12), dtype=torch.float64).reshape(3, 4)
+    if not abs(float(torch.linalg.det(projection[:, :3]))) > 0:
+        raise row.error(": the matrix projects no image")
+    shift = torch.linalg.solve(projection[:, :3], projection[:, 3])
+    numbers = [float(projection[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
+    return camera_of(row.where, numbers, size), SE3(torch.eye(3, dtype=torch.float64), -shift)
 
 
 reader = Format(

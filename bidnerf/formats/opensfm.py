@@ -17,14 +17,13 @@ from typing import Any
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidnerf_core.camera import Camera, PanoramaFace, colmap_camera
+from bidnerf_core.camera import Camera, camera_of_record
 from bidnerf_core.datasets import (
     Capture,
     DatasetOptions,
     FileNames,
     Format,
     Shot,
-    camera_of,
     first_file,
     warn_about,
 )
@@ -32,14 +31,18 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import Record, read_json
 
-PROJECTIONS = ("perspective", "brown", "simple_radial", "radial", "fisheye_opencv")
-"""The projection types that are read, besides panoramas."""
+PROJECTIONS = dict.fromkeys(("perspective", "brown", "simple_radial", "radial"), "OPENCV") | {
+    "fisheye_opencv": "OPENCV_FISHEYE",
+    "spherical": "EQUIRECTANGULAR",
+    "equirectangular": "EQUIRECTANGULAR",
+}
+"""The projection types that are read, and COLMAP's models of the same lenses."""
 
 
 def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
     """Read the reconstruction. Raises ``InputError`` if it is invalid."""
     found = read_json(file, "a reconstruction of OpenSfM")
-    parts = [part for part in found if isinstance(part, dict)] if isinstance(found, list) else []
+    parts = [part for part in (found if isinstance(found, list) else []) if isinstance(part, dict)]
     parts = [part for part in parts if isinstance(part.get("shots"), dict) and part["shots"]]
     if not parts:
         raise InputError("has no shots", where=file, expected="a list of reconstructions with shots and cameras")
@@ -78,25 +81,22 @@ def _find(path: Path) -> Path | None:
 
 
 def _camera(record: Record) -> Camera:
+    """Return the camera, whose numbers are relative to the longer side and to the centre of the image."""
     width, height = record.size("width"), record.size("height")
     kind = record.text("projection_type") or "perspective"
     if width is None or height is None:
         raise record.error("no width and height", expected="the size of its images")
-    if kind in ("spherical", "equirectangular"):
-        return PanoramaFace("front", (width, height))
     if kind not in PROJECTIONS:
         raise record.error(f"projection_type is {kind}", expected=f"one of {', '.join(PROJECTIONS)}")
     side, focal = max(width, height), record.number("focal")
     fx, fy = (record.number(key) or focal for key in ("focal_x", "focal_y"))
-    if fx is None or fy is None:
+    if PROJECTIONS[kind] != "EQUIRECTANGULAR" and (fx is None or fy is None):
         raise record.error("no focal", expected="the focal length, relative to the longer side")
-
-    keys = ("k1", "k2", "p1", "p2", "k3", "k4", "c_x", "c_y")
-    k1, k2, p1, p2, k3, k4, cx, cy = (record.number(key) or 0.0 for key in keys)
-    numbers = fx * side, fy * side, cx * side + width / 2, cy * side + height / 2
-    if kind == "fisheye_opencv":
-        return colmap_camera(record.where, "OPENCV_FISHEYE", width, height, [*numbers, k1, k2, k3, k4])
-    return camera_of(record.where, numbers, (width, height), (k1, k2, p1, p2, k3), first_centre=0)
+    centre = {"cx": ("c_x", width), "cy": ("c_y", height)}
+    values: dict[str, Any] = {name: (record.number(key) or 0.0) * side + s / 2 for name, (key, s) in centre.items()}
+    values |= {key: record.number(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
+    values |= {"camera_model": PROJECTIONS[kind], "fl_x": (fx or 0) * side, "fl_y": (fy or 0) * side}
+    return camera_of_record(Record(record.where, values), (width, height))
 
 
 reader = Format(

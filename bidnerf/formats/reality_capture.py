@@ -17,21 +17,22 @@ from pathlib import Path
 import torch
 from scipy.spatial.transform import Rotation
 
+from bidnerf_core.camera import camera_of_record
 from bidnerf_core.datasets import (
     Capture,
     DatasetOptions,
     FileNames,
     Format,
     Shot,
-    camera_of,
     column_names,
     read_table,
 )
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import Row, open_binary, read_header
+from bidnerf_core.io import Record, Row, open_binary, read_header
 
-POSE_FIELDS = ("x", "y", "alt", "heading", "pitch", "roll")
+NUMBERS = ("x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+POSE_FIELDS = NUMBERS[:6]
 
 
 def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
@@ -59,26 +60,19 @@ def file_heads(path: Path, pattern: str, expected: str) -> Iterator[tuple[Path, 
 
 def _shot(image: Path, name: str, listed: tuple[Row, dict[str, str]]) -> Shot:
     row, values = listed
-
-    def number(key: str) -> float:
-        return row.numbers([values.get(key) or "0"])[0]
-
-    angles = [-number("heading"), number("pitch"), number("roll")]
+    number = {key: row.numbers([values.get(key) or "0"])[0] for key in NUMBERS}
+    angles = [-number["heading"], number["pitch"], number["roll"]]
     turn = torch.from_numpy(Rotation.from_euler("ZXY", angles, degrees=True).as_matrix())
-    position = torch.tensor([number(key) for key in POSE_FIELDS[:3]], dtype=torch.float64)
+    position = torch.tensor([number[key] for key in POSE_FIELDS[:3]], dtype=torch.float64)
     pose = SE3(turn * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64), position)
-    if number("k4") != 0:
-        raise row.error(": k4 is not 0, which OpenCV's model does not support; export undistorted images instead")
-    size = width, height = read_header(image).size
-    focal = number("f") * max(size) / 36.0  # focal lengths refer to a film 36 mm wide
-    centre = width / 2 + number("px") * max(size), height / 2 + number("py") * max(size)
-    lens = [number(key) for key in ("k1", "k2", "t1", "t2", "k3")]
-    lens = lens if lens[4] else lens[:4]
-    return Shot(
-        image=image,
-        camera=camera_of(row.where, (focal, focal, *centre), size, lens, first_centre=0),
-        T_world_camera=pose,
-    )
+    width, height = read_header(image).size
+    side = max(width, height)
+    # Focal lengths refer to a film 36 mm wide.
+    lens = {"fl_x": number["f"] * side / 36.0, "p1": number["t1"], "p2": number["t2"]}
+    lens |= {"cx": width / 2 + number["px"] * side, "cy": height / 2 + number["py"] * side}
+    lens |= {key: number[key] for key in ("k1", "k2", "k3", "k4")}
+    camera = camera_of_record(Record(row.where, lens), (width, height))
+    return Shot(image=image, camera=camera, T_world_camera=pose)
 
 
 reader = Format(

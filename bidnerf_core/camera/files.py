@@ -241,10 +241,8 @@ def _json_camera(record: Record, size: tuple[int, int]) -> Camera:
     values = record.values
     views = values.get("parameters")
     if isinstance(views, list) and views and isinstance(views[0], Mapping):  # Open3D's trajectory
-        cameras = {parse_calibration(record.where, view, size) for view in views}
-        if len(cameras) > 1:
-            raise record.error(f"holds {len(cameras)} cameras", expected="one")
-        return cameras.pop()
+        named = {f"view {number}": parse_calibration(record.where, view, size) for number, view in enumerate(views)}
+        return _choose(Path(record.where), named, None)
     for key in ("intrinsics", "camera", "color", "colour", "rgb"):  # of an answer, Replica, RealSense
         if isinstance(inner := values.get(key), Mapping) and "fl_x" not in values:
             return _json_camera(Record(f"{record.where}: {key}", inner), size)
@@ -353,9 +351,8 @@ def parse_calibration(where: str, values: Mapping[str, Any], size: tuple[int, in
     sides = _array(where, pair).ravel().astype(int).tolist()
     if len(sides) != 2:
         raise InputError(f"size is {str(pair)[:60]!r}", where=where, expected="width and height in pixels")
-    width, height = sides
-    known = (width, height) if width > 0 and height > 0 else size
-    return _opencv_camera(where, K, tuple(_array(where, lens or []).ravel().tolist()), model, known)
+    lens = tuple(_array(where, lens or []).ravel().tolist())
+    return _opencv_camera(where, K, lens, model, (sides[0], sides[1]) if min(sides) > 0 else size)
 
 
 def _opencv_camera(where: str, K: Any, lens: tuple[float, ...], model: str, size: tuple[int, int]) -> Camera:
