@@ -30,6 +30,7 @@ from bidnerf_core.geometry import SE3
 from optional import require
 from photo_files import write_photo
 from refusals import refused
+from scan_layouts import edit_frame, edit_keys, small_views, write_image, write_nerfstudio
 
 PARAMETERS = {
     "OPENCV_FISHEYE": [60.0, 62.0, 100.0, 76.0, 0.02, -0.01, 0.003, -0.001],
@@ -138,32 +139,15 @@ def test_a_photo_is_undistorted_by_the_camera_that_is_given(tmp_path: Path) -> N
 
 def write_fisheye(folder: Path, **changes: object) -> Path:
     """A dataset of two images, of which the second has twice the size that the camera is given for."""
-    lens = lens_of("OPENCV_FISHEYE")
-    fx, fy, cx, cy, *k = PARAMETERS["OPENCV_FISHEYE"]
-    content = {
-        "camera_model": "OPENCV_FISHEYE",
-        "fl_x": fx,
-        "fl_y": fy,
-        "cx": cx,
-        "cy": cy,
-        "w": SIZE[0],
-        "h": SIZE[1],
-        **dict(zip(("k1", "k2", "k3", "k4"), k, strict=True)),
-        **changes,
-    }
-    frames = []
+    lens, names = lens_of("OPENCV_FISHEYE"), ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4")
+    file = write_nerfstudio(folder, small_views(2)) / "transforms.json"
+    keys = {"camera_model": "OPENCV_FISHEYE", "w": SIZE[0], "h": SIZE[1]}
+    edit_keys(file, **keys | dict(zip(names, PARAMETERS["OPENCV_FISHEYE"], strict=True)) | changes)
     for number in range(2):
-        pose = np.eye(4)
-        pose[0, 3] = number
-        frames.append({"file_path": f"{number}.png", "transform_matrix": pose.tolist()})
-        Image.fromarray(photo_of(lens)).save(folder / f"{number}.png")
-    mask = np.full((SIZE[1], SIZE[0]), 255, np.uint8)
-    mask[:, :100] = 0
-    Image.fromarray(mask).save(folder / "mask.png")
-    frames[1]["mask_path"] = "mask.png"
-    (folder / "transforms.json").write_text(
-        json.dumps({k: v for k, v in content.items() if v is not None} | {"frames": frames})
-    )
+        write_image(folder / f"{number}.png", photo_of(lens))
+        mask = "mask.png" if number else None
+        edit_frame(file, number, file_path=f"{number}.png", depth_file_path=None, mask_path=mask)
+    write_image(folder / "mask.png", np.repeat(np.uint8([[0, 255]]), 100, 1).repeat(SIZE[1], 0))
     return folder
 
 

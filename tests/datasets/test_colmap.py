@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -206,29 +207,35 @@ def test_what_is_left_out_is_a_setting(model: Path, scene: Known) -> None:
             SparseChoice(**{name: value})  # type: ignore[arg-type]
 
 
-def test_a_moved_world_leaves_the_points_as_they_are(model: Path, scene: Known) -> None:
-    """They are in the camera's frame, and only the shape that the training cameras make is looked at."""
-    motion = SE3.exp(torch.tensor([5.0, 1.0, -2.0, 0.3, 1.0, -0.6], dtype=torch.float64))
-    moved = SparsePoints(model, [(name, motion @ T) for name, T in places(scene)], CHOICE)
-    name = scene.views[2].frame.name
-    torch.testing.assert_close(moved.seen(name, "train"), opened(model, scene).seen(name, "train"))
+MOTION = SE3.exp(torch.tensor([5.0, 1.0, -2.0, 0.3, 1.0, -0.6], dtype=torch.float64))
+AWAY = SE3.exp(torch.tensor([2.0, 0, 0, 0, 0, 0], dtype=torch.float64))
 
 
-def test_no_pose_of_another_split_is_looked_at(model: Path, scene: Known) -> None:
-    """The frame that is sought is not among the places, and its points are right all the same."""
-    sparse = SparsePoints(model, places(scene)[1:], CHOICE)
-    assert sparse.cameras == 5
-    torch.testing.assert_close(sparse.seen(scene.views[0].frame.name, "train"), scene.truth(0))
-
-
-def test_a_few_misplaced_cameras_do_not_change_the_unit(model: Path, scene: Known) -> None:
-    wrong = [
-        (name, T @ SE3.exp(torch.tensor([2.0, 0, 0, 0, 0, 0], dtype=torch.float64)) if i == 3 else T)
-        for i, (name, T) in enumerate(places(scene))
-    ]
-    sparse = SparsePoints(model, wrong, CHOICE)
-    assert sparse.cameras < len(wrong)
-    assert sparse.metres == pytest.approx(sparse_model.UNIT, rel=0.02)
+@pytest.mark.parametrize(
+    ("change", "used", "tolerance"),
+    [
+        (
+            lambda known: [(name, MOTION @ T) for name, T in known],
+            6,
+            1e-6,
+        ),  # only the shape that the cameras make counts
+        (lambda known: known[:2] + known[3:], 5, 1e-6),  # the frame that is sought is of another split
+        (lambda known: [(name, T @ AWAY if i == 3 else T) for i, (name, T) in enumerate(known)], 5, 0.02),
+    ],
+    ids=["a moved world", "without the frame", "a misplaced camera"],
+)
+def test_the_unit_follows_from_the_training_cameras(
+    change: Callable[[list[tuple[str, SE3]]], list[tuple[str, SE3]]],
+    used: int,
+    tolerance: float,
+    model: Path,
+    scene: Known,
+) -> None:
+    sparse = SparsePoints(model, change(places(scene)), CHOICE)
+    assert sparse.cameras == used
+    assert sparse.metres == pytest.approx(sparse_model.UNIT, rel=tolerance)
+    seen = sparse.seen(scene.views[2].frame.name, "train")
+    torch.testing.assert_close(seen, scene.truth(2), rtol=tolerance, atol=1e-6)
 
 
 def test_cameras_that_tell_no_unit_are_refused(model: Path, scene: Known) -> None:
