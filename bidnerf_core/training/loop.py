@@ -41,23 +41,21 @@ class TrainingState:
 
 @runtime_checkable
 class Report(Protocol):
-    """Receives a recipe's progress and keeps its state."""
+    """Receives a recipe's progress and keeps its state; by default, it ignores both."""
 
     def resume(self) -> TrainingState | None:
         """Return the state to resume from, or None to start from scratch."""
-        ...
+        return None
 
     def step(self, progress: TrainingStep) -> None:
         """Receive the progress after each step."""
-        ...
 
     def due(self, step: int) -> bool:
         """Return whether ``save`` should be called after this step."""
-        ...
+        return False
 
     def save(self, state: TrainingState) -> None:
         """Store the state."""
-        ...
 
     @property
     def stopping(self) -> bool:
@@ -65,20 +63,10 @@ class Report(Protocol):
         ...
 
 
-class Silent:
+class Silent(Report):
     """A report without display or checkpoints."""
 
     stopping = False
-
-    def resume(self) -> TrainingState | None:
-        return None
-
-    def step(self, progress: TrainingStep) -> None: ...
-
-    def due(self, step: int) -> bool:
-        return False
-
-    def save(self, state: TrainingState) -> None: ...
 
 
 class TrainingStopped(Exception):

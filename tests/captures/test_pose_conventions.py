@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import pytest
@@ -26,10 +26,10 @@ IMAGES = 13  # enough for another order as text
 CYCLED = torch.tensor([[0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
 
 
-def images(points: Points, poses: list[SE3]) -> list[ImageKeypoints]:
-    """The keypoints of a ring of cameras, with other ``poses`` than the true ones."""
-    found = detect_keypoints(ring(points, len(poses)), points)
-    return [replace(image, T_ref_camera=T) for image, T in zip(found, poses, strict=True)]
+def seen_from(points: Points, truth: Sequence[SE3], given: Sequence[SE3]) -> list[ImageKeypoints]:
+    """Return the keypoints of images from true poses, with ``given`` ones."""
+    found = detect_keypoints([points.view(T, seed=i) for i, T in enumerate(truth)], points)
+    return [replace(image, T_ref_camera=T) for image, T in zip(found, given, strict=True)]
 
 
 def true_poses(count: int = IMAGES) -> list[SE3]:
@@ -41,7 +41,7 @@ def with_axes(T: SE3, axes: Tensor) -> SE3:
 
 
 def judged(poses: list[SE3], noise: float = 0.4, outliers: float = 0.2) -> PoseContradiction | None:
-    return pose_contradiction(images(Points(COUNT, noise, outliers), poses))
+    return pose_contradiction(seen_from(Points(COUNT, noise, outliers), true_poses(len(poses)), poses))
 
 
 def is_explained(found: PoseContradiction | None, given: list[SE3], truth: list[SE3]) -> bool:
@@ -59,11 +59,9 @@ def test_right_poses_are_in_the_expected_convention_in_any_world() -> None:
 @pytest.mark.parametrize(("axes", "height"), [(torch.eye(3, dtype=torch.float64), 0.0), (REVERSED, 0.3)])
 def test_inverse_matrices_are_recognised(axes: Tensor, height: float) -> None:
     """Also of cameras that turn about one axis only: other axes explain their rotations as well as the inverses do."""
-    points = Points(COUNT, 0.4, 0.2)
     truth = [looking_in(0.105 * i, height * (i % 3)) for i in range(IMAGES)]
-    seen = detect_keypoints([points.view(T, seed=i) for i, T in enumerate(truth)], points)
     given = [with_axes(T, axes).inverse() for T in truth]
-    found = require(pose_contradiction([replace(p, T_ref_camera=T) for p, T in zip(seen, given, strict=True)]))
+    found = require(pose_contradiction(seen_from(Points(COUNT, 0.4, 0.2), truth, given)))
     assert "inverses" in found.sentence
 
 
@@ -97,10 +95,9 @@ def test_right_poses_before_a_wall_are_not_refused() -> None:
     points.positions[:, 2] = 0
     places = [-2 + 0.3 * i for i in range(IMAGES)]
     poses = [looking_at([x, -0.3, -3.0], [0.5 * x + 1, 0.0, 0.0]) for x in places]
-    seen = detect_keypoints([points.view(T, seed=i) for i, T in enumerate(poses)], points)
-    assert pose_contradiction(seen) is None
+    assert pose_contradiction(seen_from(points, poses, poses)) is None
     given = [with_axes(T, REVERSED) for T in poses]
-    found = pose_contradiction([replace(p, T_ref_camera=T) for p, T in zip(seen, given, strict=True)])
+    found = pose_contradiction(seen_from(points, poses, given))
     assert found is None or found.reading is None or is_explained(found, given, poses)
 
 
@@ -109,13 +106,12 @@ def test_pure_rotation_and_pure_translation_are_not_refused() -> None:
     start = looking_in(0.0)
     for step in ([0, 0, 0, 0, 0.02, 0], [0.05, 0, 0, 0, 0, 0], [0, 0, 0.05, 0, 0, 0]):
         poses = [start @ SE3.exp(i * torch.tensor(step, dtype=torch.float64)) for i in range(IMAGES)]
-        views = [points.view(T, seed=i) for i, T in enumerate(poses)]
-        assert pose_contradiction(detect_keypoints(views, points)) is None
+        assert pose_contradiction(seen_from(points, poses, poses)) is None
 
 
 def test_images_that_share_nothing_tell_nothing() -> None:
     generator = torch.Generator().manual_seed(0)
-    found = images(Points(COUNT), [with_axes(T, REVERSED) for T in true_poses()])
+    found = seen_from(Points(COUNT), true_poses(), [with_axes(T, REVERSED) for T in true_poses()])
     for image in found:
         image.keypoints.descriptors.random_(0, 256, generator=generator)
     assert pose_contradiction(found) is None
@@ -168,7 +164,7 @@ def test_mistakes_are_refused_with_the_remedy_that_works(mistake: str) -> None:
     change, words = WRONG[mistake]
     truth = SE3.stack(irregular_poses())
     given = change(truth)
-    found = require(pose_contradiction(seen_from(truth, given, COUNT)))
+    found = require(pose_contradiction(seen_from(Points(COUNT, 0.4, 0.1), [*truth], [*given])))
     assert words in found.sentence
     assert found.agreeing >= 0.9 * found.pairs
     assert found.agreeing_as_given < 0.3 * found.pairs
@@ -186,16 +182,10 @@ def irregular_poses(count: int = IMAGES) -> list[SE3]:
     return [looking_in(0.12 * i, 0.15 * (-1) ** i) @ SE3.exp(shifts[i]) for i in range(count)]
 
 
-def seen_from(truth: SE3, given: SE3, count: int) -> list[ImageKeypoints]:
-    """The keypoints of images from true poses, with given ones."""
-    points = Points(count, 0.4, 0.1)
-    found = detect_keypoints([points.view(truth[i], seed=i) for i in range(len(truth.translation))], points)
-    return [replace(image, T_ref_camera=given[i]) for i, image in enumerate(found)]
-
-
 def test_positions_that_are_scaled_along_one_axis_are_refused() -> None:
-    truth = SE3.stack(irregular_poses())
-    assert pose_contradiction(seen_from(truth, positions(truth, 1, 1, 2), COUNT)) is not None
+    truth = irregular_poses()
+    given = [*positions(SE3.stack(truth), 1, 1, 2)]
+    assert pose_contradiction(seen_from(Points(COUNT, 0.4, 0.1), truth, given)) is not None
 
 
 def test_images_in_no_order_are_judged_as_well() -> None:

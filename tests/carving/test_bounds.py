@@ -70,11 +70,9 @@ def test_bounds_by_landmarks_have_no_unit() -> None:
     views = captured()
     here = estimate_bounds(views)
     there = estimate_bounds([_larger(view, 50.0) for view in views])
-    assert there.near == pytest.approx(50 * here.near, rel=1e-4)
-    assert there.far == pytest.approx(50 * here.far, rel=1e-4)
-    assert there.lower == pytest.approx([50 * x for x in here.lower], rel=1e-4)
-    assert there.upper == pytest.approx([50 * x for x in here.upper], rel=1e-4)
-    assert there.footprint == pytest.approx(50 * here.footprint, rel=1e-4)
+    for part in ("near", "far", "lower", "upper", "footprint"):
+        expected = 50 * torch.tensor(getattr(here, part))
+        torch.testing.assert_close(torch.tensor(getattr(there, part)), expected, rtol=1e-4, atol=1e-4)
 
 
 def test_a_few_landmarks_give_no_box() -> None:

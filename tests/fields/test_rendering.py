@@ -90,10 +90,9 @@ def render_slowly(field: RadianceField, rays: Rays, samples: RaySamples, backgro
 def test_rendering_is_the_slow_loop() -> None:
     rays, field = some_rays(20), Fog(Gaps(), [])
     rendering = render(field, rays, BLUE)
-    rgb, distance, opacity = render_slowly(Fog(Gaps(), []), rays, Gaps()(rays), BLUE)
-    np.testing.assert_allclose(rendering.rgb.numpy(), rgb, atol=1e-12)
-    np.testing.assert_allclose(rendering.distance.numpy(), distance, atol=1e-12)
-    np.testing.assert_allclose(rendering.opacity.numpy(), opacity, atol=1e-12)
+    expected = render_slowly(Fog(Gaps(), []), rays, Gaps()(rays), BLUE)
+    for found, part in zip((rendering.rgb, rendering.distance, rendering.opacity), expected, strict=True):
+        np.testing.assert_allclose(found.numpy(), part, atol=1e-12)
 
 
 def test_only_valid_samples_are_queried() -> None:

@@ -217,30 +217,20 @@ def drawn(view: View, name: DrawerName) -> torch.Tensor:
     return view.frame.rgb[pixels[:, 1], pixels[:, 0]]
 
 
-def batch(view: View) -> torch.Tensor:
-    return RayBank([view], demo_object().bounds).draw(2000, torch.Generator().manual_seed(0)).observed.rgb
-
-
-def free(view: View) -> torch.Tensor:
-    return FreeSpace.seen_by(view).levels[0]
-
-
 def scored(view: View) -> torch.Tensor:
     grey = torch.full_like(view.frame.rgb, 0.5)
     image = RenderedImage(grey, grey[..., 0], grey[..., 0])
     return torch.tensor(rendering_scores(image, view.frame).psnr)
 
 
-def measured(view: View) -> torch.Tensor:
-    return photo_measures([view])[1:]
-
-
 INFLUENCED: dict[str, Callable[[View], torch.Tensor]] = {
     "rays": lambda view: drawn(view, "uniform"),
-    "training rays": batch,
-    "free space": free,
+    "training rays": lambda view: (
+        RayBank([view], demo_object().bounds).draw(2000, torch.Generator().manual_seed(0)).observed.rgb
+    ),
+    "free space": lambda view: FreeSpace.seen_by(view).levels[0],
     "scores": scored,
-    "measures": measured,
+    "measures": lambda view: photo_measures([view])[1:],
     "thumbnail": lambda view: Thumbnail.of(view, 12).rgb,
     "blurred colours": lambda view: averaged(view.frame, 4)[:, 13:],
     "blankness": lambda view: torch.tensor(is_blank(view.frame)),

@@ -84,6 +84,12 @@ def motions() -> Tensor:
     return errors(seed=5)
 
 
+def inaccurate(noise: float = 0.0, outliers: float = 0.0, moving: bool = False) -> tuple[Capture, SE3]:
+    """Return a capture, and its poses with errors."""
+    capture = Capture(noise, outliers, moving)
+    return capture, capture.poses.retract(errors())
+
+
 def prior(given: SE3, motion: MotionPrior = STILL) -> PosePrior:
     return PosePrior(given, MILLIMETRES, RADIANS, motion)
 
@@ -102,8 +108,7 @@ def off(found: SE3, true: SE3) -> tuple[float, float]:
 
 @pytest.mark.parametrize("motion", [STILL, MotionPrior(MILLIMETRES, RADIANS)])
 def test_the_gradient_is_the_numerical_one(motion: MotionPrior) -> None:
-    capture = Capture(noise=1.0, outliers=0.1, moving=motion != STILL)
-    given = capture.poses.retract(errors())
+    capture, given = inaccurate(noise=1.0, outliers=0.1, moving=motion != STILL)
     seen, held = capture.seen(given), prior(given, motion)
     points = capture.points + 0.01
 
@@ -130,8 +135,7 @@ def test_the_gradient_is_the_numerical_one(motion: MotionPrior) -> None:
 
 @pytest.mark.parametrize(("motion", "size"), [(STILL, 6), (MotionPrior(MILLIMETRES, RADIANS), 12)])
 def test_the_schur_complement_gives_the_step_of_the_whole_equations(motion: MotionPrior, size: int) -> None:
-    capture = Capture(noise=1.0)
-    given = capture.poses.retract(errors())
+    capture, given = inaccurate(noise=1.0)
     system = linearize(capture.seen(given), at_rest(given, capture.points), prior(given, motion), 1.0)
     rows, columns = size * VIEWS, 3 * POINTS
     whole = torch.zeros(rows + columns, rows + columns, dtype=torch.float64)
@@ -163,8 +167,7 @@ def test_exact_poses_do_not_move(motion: MotionPrior) -> None:
 
 def test_exact_sightings_take_errors_of_poses_back() -> None:
     """What is left is what no image shows: a motion and a scale of everything, about which the prior has an opinion."""
-    capture = Capture()
-    given = capture.poses.retract(errors())
+    capture, given = inaccurate()
     found = capture.adjust_bundle(given, prior(given), tolerance=1e-12).T_world_camera
     translation, rotation = off(relative(found), relative(capture.poses))
     before = off(relative(given), relative(capture.poses))
@@ -173,8 +176,7 @@ def test_exact_sightings_take_errors_of_poses_back() -> None:
 
 
 def test_motions_are_found_with_the_poses() -> None:
-    capture = Capture(noise=0.3, moving=True)
-    given = capture.poses.retract(errors())
+    capture, given = inaccurate(noise=0.3, moving=True)
     still = capture.adjust_bundle(given, prior(given))
     moving = capture.adjust_bundle(given, prior(given, MotionPrior(MILLIMETRES, RADIANS)))
     assert bool((still.motion == 0).all())
@@ -186,8 +188,7 @@ def test_motions_are_found_with_the_poses() -> None:
 
 
 def test_the_mean_motion_is_zero() -> None:
-    capture = Capture(noise=0.3)
-    given = capture.poses.retract(errors())
+    capture, given = inaccurate(noise=0.3)
     found = capture.adjust_bundle(given, replace(prior(given), translation=1.0, rotation=0.5))
     mean = (found.T_world_camera.translation - given.translation).mean(0)
     typical = (found.T_world_camera.translation - given.translation).norm(dim=-1).median()
@@ -195,8 +196,7 @@ def test_the_mean_motion_is_zero() -> None:
 
 
 def test_a_moved_world_has_moved_poses() -> None:
-    capture = Capture(noise=0.5)
-    given = capture.poses.retract(errors())
+    capture, given = inaccurate(noise=0.5)
     T = SE3.exp(torch.tensor([3.0, -1.0, 2.0, 0.5, 1.0, -0.3], dtype=torch.float64))
     here = capture.adjust_bundle(given, prior(given))
     moved = T @ given
@@ -218,8 +218,7 @@ def test_outliers_and_a_wrong_pose_do_not_pull_the_others_away() -> None:
 
 
 def test_an_image_without_sightings_stays() -> None:
-    capture = Capture(noise=0.3)
-    given = capture.poses.retract(errors())
+    capture, given = inaccurate(noise=0.3)
     seen = capture.seen(given)
     start = at_rest(given, capture.points)
     found = adjust_bundle(seen[seen.view != 3], start, prior(given), capture.accuracy).T_world_camera

@@ -201,10 +201,9 @@ def test_progress_counts_and_remarks_are_logged(
     caplog.set_level(logging.INFO, "bidnerf")
     seen = list[Progress]()
     trained(tmp_path / "map", bake=BAKE, progress=seen.append)
-    steps = [now.done for now in seen if now.stage == "training"]
-    assert steps == list(range(1, tiny.STEPS + 1))
-    last = next(now for now in reversed(seen) if now.stage == "training")
-    assert str(last).startswith(f"training: {tiny.STEPS}/{tiny.STEPS} steps, loss ")
+    training = [now for now in seen if now.stage == "training"]
+    assert [now.done for now in training] == list(range(1, tiny.STEPS + 1))
+    assert str(training[-1]).startswith(f"training: {tiny.STEPS}/{tiny.STEPS} steps, loss ")
     assert "surface of" in caplog.text
     assert capfd.readouterr() == ("", "")
 

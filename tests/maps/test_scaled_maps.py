@@ -124,12 +124,10 @@ def test_known_positions_come_from_a_file(ground: Map, tmp_path: Path) -> None:
     file.write_text(json.dumps({f"{name}.jpg": place.tolist() for name, place in known.items()}))
     assert factor_of_poses(ground, read_positions(file)).factor == pytest.approx(3)
     poses = [{"frame": c.name, "T_world_camera": c.pose.matrix().tolist()} for c in ground.info.cameras]
-    file.write_text(json.dumps(poses))
-    assert factor_of_poses(ground, read_positions(file)).factor == pytest.approx(1)
-    file.write_text("\n".join(map(json.dumps, poses)))
-    assert factor_of_poses(ground, read_positions(file)).factor == pytest.approx(1)
-    file.write_text(json.dumps({pose["frame"]: pose["T_world_camera"] for pose in poses}))
-    assert factor_of_poses(ground, read_positions(file)).factor == pytest.approx(1)
+    by_name = {pose["frame"]: pose["T_world_camera"] for pose in poses}
+    for content in (json.dumps(poses), "\n".join(map(json.dumps, poses)), json.dumps(by_name)):
+        file.write_text(content)
+        assert factor_of_poses(ground, read_positions(file)).factor == pytest.approx(1)
     form = '{"NAME": [x, y, z], ...} or [{"frame": "NAME", "T_world_camera": 4x4 rows}, ...]'
     for wrong in (
         '{"c0": [1, 2]}',
