@@ -1,7 +1,7 @@
 r"""Answers on record: what the localizer says to the same images, before and after a change of its code.
 
     python benchmarks/answer_maps.py MAP [MAP ...]
-    python benchmarks/answers.py MAP [MAP ...] --out A.jsonl [--share 0.1]
+    python benchmarks/answers.py MAP [MAP ...] --out A.jsonl [--share 0.1] [--unchanged]
     python benchmarks/answers.py --compare A.jsonl [B.jsonl]
     python benchmarks/answers.py --record A.jsonl [A2.jsonl ...] [--name answers]
 
@@ -11,7 +11,8 @@ start and on one thread, with depth and without, under the conditions that the t
 as a row with its pose, covariance (upper triangle, single precision), outcome, reason, confidence, errors and CPU time. The
 same code gives the same rows on the same maps, to the bit, but for the time. An interrupted run resumes; several may run at a
 time on different maps, each with its own file. All conditions advance alike, so that an unfinished run covers each of them.
-``--share`` takes a part of the images, evenly spaced.
+``--share`` takes a part of the images, evenly spaced; ``--unchanged`` takes all images of the test split, those for tuning
+included, as they are.
 
 Of the frames of a test split, those for tuning are left out if at least 15 others remain. Images of other scenes, of a bare
 wall, and of a scene that stands twice have no right answer. Right for the average of two photos is the pose of either; right
@@ -20,7 +21,8 @@ scenes differ in size, errors of the position are relative to the distance of wh
 
 ``--compare`` counts, over the answers that both files have, those that are right (within 5 degrees and 0.05 units), strictly
 right (1 degree, 0.02), accepted, and silent (accepted and not right); how many of the accepted with a known error lie inside
-the 95 % bound of their covariance; and the median and the longest CPU time. Exact McNemar tests of both files follow, and how
+the 95 % bound of their covariance; the median squared error of the right ones, in units of the covariance and relative to the
+median of its distribution (1 for a true covariance); and the median and the longest CPU time. Exact McNemar tests of both files follow, and how
 many answers changed. ``--record`` joins files into ``results/NAME.rows.jsonl.xz``, and summarises them in
 ``results/NAME.json``.
 """
@@ -37,6 +39,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import planar_scenes
@@ -58,7 +61,7 @@ from _lab import (
 )
 from answer_maps import data_folder, folder_of, map_folder
 from repeated_scene import copies, double
-from scipy.stats import binomtest
+from scipy.stats import binomtest, chi2
 from torch import Generator, Tensor
 from torch.nn.functional import interpolate
 
@@ -325,13 +328,14 @@ class Subject:
         data, frame = self.foreign.get(name, (self.scene.dataset, name))
         return data.views("test", [frame])[0]
 
-    def plan(self, share: float) -> Iterator[tuple[float, str, str, str]]:
+    def plan(self, share: float, unchanged: bool) -> Iterator[tuple[float, str, str, str]]:
         """Yield for each question how far down its condition's list it stands, mode, condition, and frame."""
+        every = self.scene.dataset.frame_names("test")
         for condition, how in CONDITIONS.items():
-            if condition == "plane":
+            if condition == "plane" or (unchanged and condition != "as it is"):
                 continue
-            names = list(self.foreign) if condition == "other scene" else self.frames
-            taken = spread(names, round(FRAMES * how.share))
+            names = list(self.foreign) if condition == "other scene" else every if unchanged else self.frames
+            taken = spread(names, len(every) if unchanged else round(FRAMES * how.share))
             taken = spread(taken, max(1, round(share * len(taken))))
             for place, name in enumerate(taken):
                 has_depth = self.view(name).frame.has_depth
@@ -339,9 +343,11 @@ class Subject:
                     if mode == "RGB-D" or not how.needs_depth:
                         yield (place + 0.5) / len(taken), mode, condition, name
 
-    def questions(self, share: float) -> Iterator[tuple[tuple[str, str, str, str], Callable[[], Question]]]:
+    def questions(
+        self, share: float, unchanged: bool
+    ) -> Iterator[tuple[tuple[str, str, str, str], Callable[[], Question]]]:
         """Yield keys and how to make their questions, so that all conditions advance alike."""
-        for _, mode, condition, name in sorted(self.plan(share), key=lambda some: some[0]):
+        for _, mode, condition, name in sorted(self.plan(share, unchanged), key=lambda some: some[0]):
             key = (self.name, mode, condition, name)
             yield key, lambda key=key: self.question(key)  # type: ignore[misc]
 
@@ -402,11 +408,13 @@ class Planes:
             asked = Question(key, bare.frame, localizer)
             self._questions.append((key, lambda asked=asked: asked))  # type: ignore[misc]
 
-    def questions(self, share: float) -> Iterator[tuple[tuple[str, str, str, str], Callable[[], Question]]]:
+    def questions(
+        self, share: float, unchanged: bool
+    ) -> Iterator[tuple[tuple[str, str, str, str], Callable[[], Question]]]:
         yield from self._questions[:: max(1, round(1 / share))]
 
 
-def run(names: Sequence[str], out: Path, share: float) -> None:
+def run(names: Sequence[str], out: Path, share: float, unchanged: bool) -> None:
     """Ask all questions to which the file holds no answer yet."""
     with RowStore(out) as store:
         for name in names:
@@ -417,7 +425,7 @@ def run(names: Sequence[str], out: Path, share: float) -> None:
                     f"{out}: has answers of another map of {name}, {about['content']}, expected those of"
                     f" {subject.content}; name another --out"
                 )
-            for key, question in subject.questions(share):
+            for key, question in subject.questions(share, unchanged):
                 store.get(list(key), lambda question=question: question().answer())  # type: ignore[misc]
             print(f"{name}: done", flush=True)
 
@@ -451,6 +459,8 @@ def answers_of(rows: dict[tuple[str, ...], Row]) -> dict[tuple[str, ...], Row]:
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
     """Return the counts of some answers."""
     judged, times = judgement(rows), cpu_seconds(rows)
+    squared = [row["normalized_error_squared"] for row in rows if within(row)]
+    known = [value for value in squared if value is not None]
     return {
         "n": len(rows),
         "right": sum(map(within, rows)),
@@ -458,6 +468,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
         "accepted": judged["converged"],
         "silent": judged["silent"],
         "inside": judged["inside_95_of_converged"],
+        "scale": median(known) / float(chi2.median(6)) if known else None,
         "median_s": times["median_cpu_seconds"],
         "slowest_s": times["slowest_cpu_seconds"],
     }
@@ -518,6 +529,7 @@ def shown(counts: dict[str, Any]) -> list[str]:
     """Return counts as the cells of a table."""
     parts = [str(counts[name]) for name in ("right", "strict", "accepted", "silent")]
     parts.append("/".join(map(str, counts["inside"])))
+    parts.append("-" if counts["scale"] is None else f"{counts['scale']:.2f}")
     return parts + [f"{counts[name]:.2f}" for name in ("median_s", "slowest_s")]
 
 
@@ -532,8 +544,10 @@ def compare(paths: Sequence[Path]) -> None:
         f"{len(keys)} answers"
         + (f" that both have; only in one: {left_out[0]}, {left_out[1]}" if len(files) > 1 else "")
     )
-    print("\n| map | mode | condition | n | right | strict | accepted | silent | inside 95 % | median s | slowest s |")
-    print("|---|---|---|---|---|---|---|---|---|---|---|")
+    print(
+        "\n| map | mode | condition | n | right | strict | accepted | silent | inside 95 % | scale | median s | slowest s |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|---|---|")
     for (name, mode, condition), some in cells(keys).items():
         columns = zip(*(shown(summary([rows[key] for key in some])) for rows in files), strict=True)
         print(f"| {name} | {mode} | {condition} | {len(some)} | " + " | ".join(map(" / ".join, columns)) + " |")
@@ -576,6 +590,7 @@ def main() -> None:
     found.add_argument("maps", nargs="*", metavar="MAP", help=f"name of a dataset, or {PLANES}")
     found.add_argument("--out", type=Path, metavar="JSONL", help="file of the rows")
     found.add_argument("--share", type=float, default=1.0, help="part of the images (default: %(default)s)")
+    found.add_argument("--unchanged", action="store_true", help="take all images of the test split as they are")
     found.add_argument("--compare", nargs="+", type=Path, metavar="ROWS", help="one or two files of rows")
     found.add_argument("--record", nargs="+", type=Path, metavar="ROWS", help="files of rows to join")
     found.add_argument("--name", default="answers", help="of the record (default: %(default)s)")
@@ -592,7 +607,7 @@ def main() -> None:
         if given.out is None or not 0 < given.share <= 1:
             found.error("expected --out FILE for the rows of maps, and a --share above 0 and up to 1")
         one_thread()
-        run(given.maps, given.out, given.share)
+        run(given.maps, given.out, given.share, given.unchanged)
 
 
 if __name__ == "__main__":
