@@ -21,7 +21,6 @@ from bidnerf_core.localization import (
     ADVICE,
     DISPLACEMENT,
     METHODS,
-    MIRROR,
     LandmarkAnswer,
     Localization,
     SceneMap,
@@ -268,7 +267,7 @@ def _matches(scene: SceneMap, localization: Localization, answer: LandmarkAnswer
     there = torch.where(seen.front[0, :, None], there, torch.nan)
     size = torch.tensor([query.camera.width, query.camera.height], dtype=torch.float64)
     shares = [query.keypoints.pixels[keypoint] / size, there / size]
-    if mode.name == MIRROR:  # drawn on the image as it is
+    if mode.mirrored:  # drawn on the image as it is
         shares = [torch.stack([1 - share[:, 0], share[:, 1]], dim=-1) for share in shares]
     every = max(1, math.ceil(len(keypoint) / 600))  # at most 600 are drawn
     return {
@@ -288,7 +287,7 @@ def _runner_up(scene: SceneMap, localization: Localization, record: SearchRecord
         if given_up := name_earlier(localization, answer):
             return _other_pose(given_up, answer.T_world_rig.to("cpu"))
         for mode, T, probability in probable_poses(answer):
-            if mode != answer.posterior.mode and answer.modes[mode].name != MIRROR:
+            if mode != answer.posterior.mode and not answer.modes[mode].mirrored:
                 return _other_pose("the next most probable pose by landmarks", T, probability)
     T = localization.T_world_camera.to("cpu", torch.float64)
     middle = T.inverse().apply(torch.tensor(scene.bounds.centre, dtype=torch.float64))

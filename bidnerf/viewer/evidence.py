@@ -14,8 +14,6 @@ from bidnerf_core.localization import (
     ACCEPTED,
     CAMERAS,
     DISPLACEMENT,
-    MIRROR,
-    MOVING,
     Evidence,
     LandmarkAnswer,
     Localization,
@@ -76,20 +74,19 @@ def _compare_modes(localization: Localization, answer: LandmarkAnswer) -> JsonOb
         name = f"a pose {distance:.3g} {symbol(localization.unit)} away"
         if mode == best:
             name = name_earlier(localization, answer) or HERE
-        name = "the mirror image" if answer.modes[mode].name == MIRROR else name
+        name = "the mirror image" if answer.modes[mode].mirrored else name
         shown.append((name, probability, None if mode == best else matrix_rows(T)))
-    others = {mode.name == MIRROR for mode in answer.modes[1:]}
+    others = {mode.mirrored for mode in answer.modes[1:]}
     question = "Pose or mirror image?" if others == {True} else "This pose or another?"
     return _contest("This pose, another, or the mirror image?" if len(others) > 1 else question, shown)
 
 
 def _compare_cameras(localization: Localization, answer: LandmarkAnswer) -> JsonObject:
-    posterior, names = answer.posterior, answer.explanations.names
+    posterior, given = answer.posterior, answer.explanations
     own = posterior.probability * (posterior.states.mode == posterior.mode)
     shown = dict[str, float]()
     for row, probability in zip(posterior.states.row.tolist(), (own / own.sum()).tolist(), strict=True):
-        name = CAMERAS[names[row].removesuffix(MOVING)]
-        name += ", with rolling shutter" if names[row].endswith(MOVING) else ""
+        name = CAMERAS[given.cameras[row]] + (", with rolling shutter" if given.moves[row] else "")
         shown[name] = shown.get(name, 0.0) + probability
     # Explanations that are less probable than one in a thousand are not listed.
     likely = [each for each in sorted(shown.items(), key=lambda each: -each[1]) if each[1] >= 0.001]

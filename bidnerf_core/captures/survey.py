@@ -24,7 +24,7 @@ from bidnerf_core.captures.report import CaptureReport, PhotoProblem, PhotoRecor
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import MIRROR, LandmarkMatcher, Loop, Outcome
+from bidnerf_core.localization import LandmarkMatcher, Loop, Outcome
 from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
     ENOUGH_IMAGES,
@@ -245,7 +245,7 @@ def relocate_photos(
         if answer is None or answer.verdict.outcome not in (Outcome.CONVERGED, Outcome.AMBIGUOUS, Outcome.MIRRORED):
             continue
         mirrored = answer.verdict.outcome is Outcome.MIRRORED
-        others = [answer.posterior.place(g) for g, mode in enumerate(answer.modes) if mode.name != MIRROR]
+        others = [answer.posterior.place(g) for g, mode in enumerate(answer.modes) if not mode.mirrored]
         given = view.T_ref_camera.to("cpu", torch.float64).inverse()
         updates = [(given @ T).log() for T in (answer.T_world_rig, *([] if mirrored else others))]
         update = min(updates, key=lambda each: float(each[:3].norm()))

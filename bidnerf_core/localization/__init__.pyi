@@ -14,14 +14,12 @@ from .accept import support as support
 from .auto import localize_by_landmarks as localize_by_landmarks
 from .by_surface import is_blank as is_blank
 from .explanations import CAMERAS as CAMERAS
-from .explanations import MOVING as MOVING
 from .localizer import Localizer as Localizer
 from .localizer import Start as Start
 from .localizer import picture_at as picture_at
 from .localizer import scene_of as scene_of
 from .localizer import start_pose as start_pose
 from .loop import HEAVY_TAILS as HEAVY_TAILS
-from .loop import MIRROR as MIRROR
 from .loop import LandmarkAnswer as LandmarkAnswer
 from .loop import Loop as Loop
 from .matching import LandmarkMatcher as LandmarkMatcher

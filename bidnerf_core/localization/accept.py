@@ -50,6 +50,7 @@ class Evidence:
     precision: float  # standard deviation of the position relative to the scene's distance
     mass: float  # probability that the pose is within the tolerance, and its camera credible
     searched: bool  # whether the pose was found by landmarks, not only confirmed by them
+    mirrored: bool = False  # whether the mirror image was localized
     on_surface: float | None = None  # fraction of the measured points on the surface
     colour_inliers: float | None = None  # fraction of the measured points on the surface and with its colour
     # mean robust loss of the rays relative to the usual one of the map's own images; None if no rays were rendered
@@ -61,19 +62,26 @@ class Evidence:
         return (1 + self.inliers) / (1 + self.by_chance)
 
     @property
+    def inliers_alone(self) -> float | None:
+        """The number of inliers if no rays were rendered, which confirm or contradict what few inliers show."""
+        return self.inliers if self.difference is None else None
+
+    @property
     def bounds(self) -> Iterator[tuple[Bound, float]]:
         """The bounds of ``LANDMARK_BOUNDS`` on the measures that were taken, each paired with the value of its measure."""
         for bound in LANDMARK_BOUNDS if self.searched else LANDMARK_BOUNDS[1:]:
-            value = getattr(self, bound.measure)
-            if bound.measure == "inliers" and self.difference is not None:
-                bound = bound._replace(limit=10)  # rays confirm or contradict what fewer inliers show
-            if value is not None:
+            if (value := getattr(self, bound.measure)) is not None:
                 yield bound, value
 
     @property
     def violated(self) -> list[tuple[Bound, float]]:
         """The bounds that the evidence violates, the most serious first."""
         return [(bound, value) for bound, value in self.bounds if not bound.keeps(value)]
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the verdict depends on measures that rendered rays may change."""
+        return all(bound.is_open for bound, _ in self.violated)
 
 
 class Bound(NamedTuple):
@@ -93,7 +101,9 @@ class Bound(NamedTuple):
 
 LANDMARK_BOUNDS = (
     Bound("log10_nfa", -12.0, False, Outcome.TOO_FEW_MATCHES, "{0:.0e} poses as good are expected by chance"),
-    Bound("inliers", 15, True, Outcome.TOO_FEW_MATCHES, "only {0:.0f} landmark inliers", True),
+    Bound("inliers", 10, True, Outcome.TOO_FEW_MATCHES, "only {0:.0f} landmark inliers", True),
+    Bound("inliers_alone", 15, True, Outcome.TOO_FEW_MATCHES, "only {0:.0f} landmark inliers", True),
+    Bound("mirrored", 0, False, Outcome.MIRRORED, "the mirror image fits the map better than the image", True),
     Bound("above_chance", 3.0, True, Outcome.AMBIGUOUS, "only {0:.1f} times as many landmarks match as by chance"),
     Bound("spread", 0.06, True, Outcome.UNDETERMINED, "the landmarks are all in {0:.0%} of the image"),
     Bound("other_place", 0.02, False, Outcome.AMBIGUOUS, "another place fits with a probability of {0:.0%}", True),

@@ -18,7 +18,7 @@ from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import Evidence, Support, least_confidence
 from bidnerf_core.localization.by_surface import localize_by_depth, localize_by_images
-from bidnerf_core.localization.explanations import CAMERAS, MOVING
+from bidnerf_core.localization.explanations import CAMERAS
 from bidnerf_core.localization.loop import LandmarkAnswer, Loop
 from bidnerf_core.localization.methods import METHODS, Method
 from bidnerf_core.localization.problem import Problem
@@ -113,10 +113,10 @@ def localization_of(problem: Problem, answer: LandmarkAnswer, began: float) -> L
     if answer.fused:
         reason += f", fused with {enumeration(answer.fused)}"
     if corrected is not None:
-        reason += f", with {CAMERAS[answer.explanation.removesuffix(MOVING)]}"
+        reason += f", with {CAMERAS[answer.explanation[0]]}"
         # A focal length from EXIF, or an assumed one, was not stated to be exact.
         reason += "" if problem.focal_is_approximate else " instead of the stated one"
-    if answer.explanation.endswith(MOVING):
+    if answer.explanation[1]:
         reason += ", with the motion of a rolling shutter"
     if (record := current_record()) is not None:
         record.answers.append(answer)

@@ -64,9 +64,7 @@ CAMERAS = {
 }
 """Descriptions of the explanations of the camera."""
 USUAL = ("exact", "right", "inexact", "nominal", "map", "map, about")
-"""Names of the explanations under which the stated camera, or one of the map's, is at least approximately right."""
-MOVING = " moving"
-"""Suffix of the names of explanations with a moving camera."""
+"""Cameras of which the stated one, or one of the map's, is at least approximately right."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,19 +81,20 @@ class Proposal:
 class Explanations:
     """The explanations (k) of a query, as Gaussian priors on the nuisances."""
 
-    names: tuple[str, ...]
+    cameras: tuple[str, ...]  # keys of ``CAMERAS``
+    moves: Bool[Tensor, "k"]  # whether the camera moves during the readout
     mean: Float[Tensor, "k N"]
     deviation: Float[Tensor, "k N"]
     log_prior: Float[Tensor, "k"]
     credible: Bool[Tensor, "k"]  # whether a pose under it counts as right
 
     def __len__(self) -> int:
-        return len(self.names)
+        return len(self.cameras)
 
     @property
     def usual(self) -> Bool[Tensor, "k"]:
         """Mask of the explanations under which the stated camera, or one of the map's, is at least approximately right."""
-        return torch.tensor([name.removesuffix(MOVING) in USUAL for name in self.names])
+        return torch.tensor([camera in USUAL for camera in self.cameras])
 
     @property
     def widest(self) -> int:
@@ -108,10 +107,10 @@ class Explanations:
         If the focal length or the principal point changes, the camera is moved along its axis and turned to keep about the same view.
         """
         # These three are not tried by themselves at first, since they are similar to others.
-        kinds = [i for i, name in enumerate(self.names) if name.removesuffix(MOVING) not in ("exact", "inexact", "map")]
-        kinds = kinds or list(range(len(self)))
-        still = [i for i in kinds if not self.names[i].endswith(MOVING)]
-        row = torch.tensor(still + [i for i in kinds if i not in still][:1])
+        kinds = torch.tensor([camera not in ("exact", "inexact", "map") for camera in self.cameras])
+        kinds |= ~kinds.any()
+        still, moving = ((kinds & which).nonzero()[:, 0] for which in (~self.moves, self.moves))
+        row = torch.cat([still, moving[:1]])
         k, mean, deviation = len(row), self.mean[row], self.deviation[row]
         z = torch.zeros((k, N), dtype=torch.float64)
         # A deviation of 0 holds a nuisance at its mean.
@@ -163,20 +162,18 @@ def explanations(
         rows.append(("exact", [0.0] * 6, [0.0] * 6, 1.0, True))
     single = moving and len(query.images) == 1  # views of a rig may be from different times
     share_moving, motion = motion_prior(landmarks, distance)
-    kinds = [("", [0.0] * 6, 1 - share_moving * single)]
-    if single:
-        kinds.append((MOVING, motion, share_moving))
+    kinds = [(False, [0.0] * 6, 1 - share_moving * single), (True, motion, share_moving)]
     every = [
-        (name + ending, [*c, *[0.0] * 7], [*deviation, *motion, depth_scale], share * of_kind, credible)
-        for ending, motion, of_kind in kinds
+        (name, moves, [*c, *[0.0] * 7], [*deviation, *motion, depth_scale], share * of_kind, credible)
+        for moves, motion, of_kind in kinds[: 1 + single]
         for name, c, deviation, share, credible in rows
     ]
-    names, means, deviations, shares, right = zip(*every, strict=True)
+    names, moves, means, deviations, shares, right = zip(*every, strict=True)
     mean, deviation, prior = (torch.tensor(values, dtype=torch.float64) for values in (means, deviations, shares))
     # Landmarks of this map suggest corrections even of right intrinsics; see ``calibration_scatter``.
     if query.has_one_camera:
         deviation[:, :4] = torch.hypot(deviation[:, :4], landmarks.calibration_scatter.double())
-    return Explanations(names, mean, deviation, prior.log(), torch.tensor(right))
+    return Explanations(names, torch.tensor(moves), mean, deviation, prior.log(), torch.tensor(right))
 
 
 def motion_prior(landmarks: LandmarkMap, distance: float) -> tuple[float, list[float]]:

@@ -6,8 +6,8 @@ The module also holds the steps of the loop that depend on tensors alone; a GPU 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -38,6 +38,31 @@ TOLERANCE = 0.03
 
 
 @dataclass(frozen=True, eq=False)
+class Fit:
+    """All terms fitted under each explanation (h) of each mode (g), by quadratic models about the modes' states."""
+
+    about: States  # (g)
+    quadratic: Quadratic
+    states: States  # (h) at the minima of the models
+    normal: Normal
+    weights: Float[Tensor, "h"]  # log evidence for each explanation
+    # mean loss of the rays of each mode, in squares of their scale, and Hessians of the rays alone, in the units of the models;
+    # NaN and 0 where none were rendered
+    loss: Float[Tensor, "g"] = field(default_factory=partial(torch.zeros, 0))
+    by_rays: Float[Tensor, "g P P"] = field(default_factory=partial(torch.zeros, 0, P, P))
+    log_odds: Float[Tensor, "g"] | float = 0.0  # between the modes, from measurements other than landmarks
+    # scatter of the gradients of each state (in the units of the models) beyond that of independent errors
+    systematic: Float[Tensor, "h P P"] | float = 0.0
+
+    @property
+    def likeliest(self) -> States:
+        """The most probable state of each mode: as it was fitted, if the models are about the most probable explanations."""
+        member = self.states.mode[None] == self.about.mode[:, None]
+        best = self.states[torch.where(member, self.weights[None], -torch.inf).argmax(-1)]
+        return self.about if torch.equal(best.row, self.about.row) else best
+
+
+@dataclass(frozen=True, eq=False)
 class Posterior:
     """The explanations (h) with their probabilities; poses are right updates of the most probable explanation's pose."""
 
@@ -50,30 +75,23 @@ class Posterior:
 
     @staticmethod
     def of(
-        states: States,
-        normal: Normal,
-        terms: Quadratic,
+        fit: Fit,
         landmarks: Landmarks,
         scatter: Float[Tensor, "4"],
-        systematic: Float[Tensor, "h P P"] | float = 0.0,
-        log_odds: Float[Tensor, "g"] | float = 0.0,
-        weights: Float[Tensor, "h"] | None = None,
         device: torch.device = torch.device("cpu"),  # noqa: B008
     ) -> Posterior:
-        """Compare explanations within a mode by their cost, and modes by the evidence of landmarks and their prior ``log_odds``.
+        """Compare explanations within a mode by their weights, and modes by the evidence of ``landmarks`` and their prior log odds.
 
-        ``terms`` are the quadratic models of all terms, and ``states`` and ``normal`` their minima under each explanation. ``systematic``
-        is the scatter of the gradients of each state (in the units of ``terms``) beyond that of independent errors. ``weights`` are the
-        log evidence for each explanation, by default that of all terms. Most of the computation runs on ``device``.
+        ``scatter`` are the standard deviations of spurious corrections of a camera. Most of the computation runs on ``device``.
         """
-        by_mode, information = run_on(device, _information, states, normal, terms, landmarks, systematic)
-        weights = log_evidence(states, normal) if weights is None else weights
-        member = states.mode[None] == torch.arange(len(terms.here))[:, None]
+        states, normal, weights = fit.states, fit.normal, fit.weights
+        by_mode, information = run_on(device, _information, states, normal, fit.quadratic, landmarks, fit.systematic)
+        member = states.mode[None] == torch.arange(len(fit.about))[:, None]
         norm = torch.where(member, weights[None], -torch.inf).logsumexp(-1)
         # The log odds between places do not grow in proportion to the number of matches, since the right place rarely has fewer than
         # two thirds as many as another: a factor of e in the evidence adds ten. Below an evidence of 50, places are not compared, since
         # a few chance matches are no evidence against even fewer.
-        log = weights + (log_odds + 10.0 * by_mode.clamp(min=50.0).log() - norm)[states.mode]
+        log = weights + (fit.log_odds + 10.0 * by_mode.clamp(min=50.0).log() - norm)[states.mode]
         # Finite, so that explanations none of which is determined are equally probable.
         probability = log.nan_to_num(-1e300, neginf=-1e300).softmax(0)
         best = int(probability.argmax())
@@ -103,6 +121,13 @@ class Posterior:
 
     def pose(self) -> SE3:
         return self.states.T[self.best].retract(self.mean)
+
+    @property
+    def by_mode(self) -> Float[Tensor, "g"]:
+        """The probability of each mode."""
+        return self.probability.new_zeros(int(self.states.mode.max()) + 1).index_add(
+            0, self.states.mode, self.probability
+        )
 
     def place(self, mode: int) -> SE3:
         """Return the most probable pose of a mode."""
@@ -260,15 +285,12 @@ def weigh(states: States, term: Landmarks) -> tuple[States, Landmarks]:
     return states, term.weighted_for(states)
 
 
-Minima = tuple[Quadratic, States, Normal]
-"""The quadratic model of all terms about each mode's state, and the states and normal equations at its minima under each explanation."""
-
-
-def fit_modes(best: States, terms: Sequence[CostTerm], given: Explanations, steps: int) -> tuple[States, Minima]:
-    """Return the refined state of each mode (g), and the minima about these states."""
-    best, _ = descend(best, terms, steps)
-    quadratic = linearize_modes(best, terms, given)
-    return best, (quadratic, *quadratic.minimum(given.about(quadratic.here)))
+def fit_modes(best: States, terms: Sequence[CostTerm], given: Explanations, steps: int) -> Fit:
+    """Refine the state of each mode (g), and minimize the models about these states under each explanation."""
+    about, _ = descend(best, terms, steps)
+    quadratic = linearize_modes(about, terms, given)
+    states, normal = quadratic.minimum(given.about(quadratic.here))
+    return Fit(about, quadratic, states, normal, log_evidence(states, normal))
 
 
 def linearize_modes(best: States, terms: Sequence[CostTerm], given: Explanations) -> Quadratic:
@@ -278,40 +300,29 @@ def linearize_modes(best: States, terms: Sequence[CostTerm], given: Explanations
     return Quadratic.of(total(free, terms) - prior(free), free)
 
 
-def settle(best: States, term: Landmarks, given: Explanations) -> tuple[States, Minima, States]:
-    """Fit the landmarks with newly estimated noise; return the results of ``fit``, and then the most probable state of each mode."""
-    best, (quadratic, states, normal) = fit_modes(term.with_noise(best), [term], given, 4)
-    weights = log_evidence(states, normal)
-    return best, (quadratic, states, normal), states[_most_probable(best, states, weights)]
-
-
-def _most_probable(best: States, states: States, weights: Float[Tensor, "h"]) -> Int[Tensor, "g"]:
-    """Return the numbers of the most probable of the ``states`` of each mode."""
-    member = states.mode[None] == best.mode[:, None]
-    return torch.where(member, weights[None], -torch.inf).argmax(-1)
+def fit_landmarks(best: States, term: Landmarks, given: Explanations) -> Fit:
+    """Fit the landmarks with newly estimated noise."""
+    return fit_modes(term.with_noise(best), [term], given, 4)
 
 
 def fit_with_rays(
     best: States, terms: Sequence[CostTerm], rays: RenderedRays, given: Explanations, which: Int[Tensor, "r"]
-) -> tuple[Minima, States, Float[Tensor, "h"], Float[Tensor, "g P P"], Float[Tensor, "g"]]:
-    """Refine the states ``which`` with rays, which are too expensive to be rendered for all explanations.
-
-    Returns the minima, the most probable state of each mode, the log evidence for each explanation, the Hessians of the rays alone
-    (0 for the other states), and the mean losses of the rays, divided by the square of their scale (NaN for the other states).
-    """
+) -> Fit:
+    """Fit the terms, and for the modes ``which`` also rays, which are too expensive to be rendered for all explanations."""
     rays = rays.fitted(best[which])
     here, _ = descend(best[which], [*terms, rays], 4)
-    quadratic = linearize_modes(best.with_rows(which, here), terms, given)
-    compared = rays.at(move_to(quadratic.here[which], rays.rgb.device))
-    by_rays = Quadratic.of(move_to(compared.normal(), best.z.device), quadratic.here[which])
-    plain, quadratic = quadratic, quadratic.with_rows_added(which, by_rays)
+    about = best.with_rows(which, here)
+    plain = linearize_modes(about, terms, given)
+    compared = rays.at(move_to(plain.here[which], rays.rgb.device))
+    by_rays = Quadratic.of(move_to(compared.normal(), best.z.device), plain.here[which])
+    quadratic = plain.with_rows_added(which, by_rays)
     states, normal = quadratic.minimum(given.about(quadratic.here))
     # The cost of rays has small local minima, so that few of its differences between cameras are evidence.
     weights = log_evidence(states, normal)
     weights = weights + (1 - 1 / KEYPOINTS_PER_INDEPENDENT) * (quadratic(states).cost - plain(states).cost)
-    hessian = torch.zeros_like(quadratic.hessian).index_add(0, which, by_rays.hessian)
     loss = torch.full_like(quadratic.cost, torch.nan).index_copy(0, which, compared.loss().to(best.z))
-    return (quadratic, states, normal), states[_most_probable(best, states, weights)], weights, hessian, loss
+    hessian = torch.zeros_like(quadratic.hessian).index_add(0, which, by_rays.hessian)
+    return Fit(about, quadratic, states, normal, weights, loss, hessian)
 
 
 def cost_of(points: Surface, states: States) -> Float[Tensor, "h"]:

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from bidnerf import SE3, Frame, Intrinsics, View
-from bidnerf_core.localization import MOVING
 
 # Inside: the prior of each explanation, of which answers show the most probable one
 from bidnerf_core.localization.explanations import (
@@ -62,7 +61,7 @@ def given(*cameras: Intrinsics, of_map: tuple[Intrinsics, ...] = (), **options: 
 def odds(found: Explanations, names: set[str]) -> float:
     """Return the prior odds of the explanations of these names, moving or not, against all others."""
     share = found.log_prior.softmax(0)
-    own = sum(float(p) for p, name in zip(share, found.names, strict=True) if name.removesuffix(MOVING) in names)
+    own = sum(float(p) for p, name in zip(share, found.cameras, strict=True) if name in names)
     return own / (1 - own)
 
 
@@ -161,7 +160,7 @@ def test_crops_are_compared_only_with_a_focal_length_that_is_approximate() -> No
 
 def test_images_of_different_cameras_have_the_stated_ones_as_their_only_explanation() -> None:
     found = given(PINHOLE, scaled(0.9), of_map=(PINHOLE,))
-    assert found.names == ("exact",)
+    assert found.cameras == ("exact",)
     assert bool((found.deviation[:, :6] == 0).all())
     assert cameras_of_map(query(PINHOLE, scaled(0.9)), landmarks(PINHOLE)) == []
 
@@ -171,7 +170,7 @@ def test_the_stated_camera_is_likelier_where_the_maps_images_have_it() -> None:
     stated = {"exact"}
     assert odds(own, stated) > 3 * odds(unknown, stated)
     assert odds(unknown, stated) > odds(other, stated)
-    assert not any(name.startswith("map") for name in own.names)
+    assert not any(name.startswith("map") for name in own.cameras)
 
 
 def test_the_maps_camera_is_the_less_likely_the_more_the_stated_one_differs() -> None:
@@ -181,12 +180,12 @@ def test_the_maps_camera_is_the_less_likely_the_more_the_stated_one_differs() ->
 
 def test_an_approximate_focal_length_may_be_off_by_far_and_is_credible_all_the_same() -> None:
     found = given(PINHOLE, approximate=True)
-    nominal = found.names.index("nominal")
+    nominal = found.cameras.index("nominal")
     assert float(found.deviation[nominal, 0]) >= 0.2
     assert bool(found.credible[nominal])
     stated = given(PINHOLE)
-    for name, good in zip(stated.names, stated.credible.tolist(), strict=True):
-        assert good is (name.removesuffix(MOVING) not in ("resized", "unlike"))
+    for name, good in zip(stated.cameras, stated.credible.tolist(), strict=True):
+        assert good is (name not in ("resized", "unlike"))
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
@@ -194,8 +193,8 @@ def test_only_a_single_image_may_be_moving_and_the_likelier_the_more_the_maps_im
     known = landmarks(PINHOLE, moving=share)
     single, rig = (explanations(query(*[PINHOLE] * n), known, 4.0, 0.02) for n in (1, 2))
     still = explanations(query(PINHOLE), known, 4.0, 0.02, moving=False)
-    assert not any(name.endswith(MOVING) for name in (*rig.names, *still.names))
-    moves = torch.tensor([name.endswith(MOVING) for name in single.names])
+    assert not bool((rig.moves.any() | still.moves.any()))
+    moves = single.moves
     probability = float(single.log_prior.softmax(0)[moves].sum())
     assert probability == pytest.approx(0.8 if share else 1 / 30)
     motion = single.deviation[:, 6:12]

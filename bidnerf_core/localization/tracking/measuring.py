@@ -18,7 +18,7 @@ from bidnerf_core.geometry import CORNERS_PER_INDEPENDENT, SE3, skew, update_bet
 from bidnerf_core.localization.accept import Evidence, Support, judge
 from bidnerf_core.localization.auto import within_risk
 from bidnerf_core.localization.explanations import STATED, Explanations, motion_prior
-from bidnerf_core.localization.loop import DEPTH_WIDTH, RADII
+from bidnerf_core.localization.loop import DEPTH_WIDTH
 from bidnerf_core.localization.matching import (
     CELLS,
     Projected,
@@ -26,7 +26,8 @@ from bidnerf_core.localization.matching import (
     cells,
     log10_nfa,
 )
-from bidnerf_core.localization.posterior import TOLERANCE, Posterior, linearize_modes, mass_within
+from bidnerf_core.localization.modes import RADII
+from bidnerf_core.localization.posterior import TOLERANCE, Posterior, fit_modes, mass_within
 from bidnerf_core.localization.problem import SceneMap
 from bidnerf_core.localization.propose import LEAST_AGREEING, consensus_near, landmarks_near, search_radius
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
@@ -194,7 +195,8 @@ class Measurer:
         deviation[1, MOTION] = torch.tensor(motion_deviation, dtype=torch.float64)
         deviation[:, DEPTH] = DEPTH_WIDTH * self.sensor.scale
         log_prior = torch.tensor([1 - moving, moving], dtype=torch.float64).log()
-        given = Explanations(("still", "moving"), 0 * deviation, deviation, log_prior, torch.ones(2, dtype=torch.bool))
+        both = torch.tensor([False, True])
+        given = Explanations(("exact", "exact"), both, 0 * deviation, deviation, log_prior, both | True)
         states, rounds = given.about(fit.states), 2
         if not fit.is_recognised:
             states, rounds = states[int(state.moves) :][:1], 1 + state.moves
@@ -212,8 +214,7 @@ class Measurer:
         if fit.is_recognised:
             exact = torch.tensor(STATED[0][1:5], dtype=torch.float64)
             deviation[:, :4] = torch.hypot(exact, scatter)  # the camera is free
-            model = linearize_modes(here, terms, given)
-            mixture = Posterior.of(*model.minimum(given.about(model.here)), model, term, scatter).mixture()
+            mixture = Posterior.of(fit_modes(here, terms, given, 0), term, scatter).mixture()
             if not bool((mixture + covariance).isfinite().all()):
                 why = Verdict(Outcome.UNDETERMINED, "the landmarks do not determine the pose")
                 return Measurement.of(predicted, predicted, why, float(here.noise), state)

@@ -1,0 +1,162 @@
+"""Modes: the places, and the mirror image, that may explain a query, each with the matches that agree with it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from bidnerf_core.devices import run_on
+from bidnerf_core.localization.explanations import Explanations, Proposal
+from bidnerf_core.localization.matching import STRONGEST, LandmarkMatcher, Matches, Nearest, Projected, QueryKeypoints
+from bidnerf_core.localization.posterior import graduate, most_probable, refine
+from bidnerf_core.localization.propose import LEAST_AGREEING, consensus, inliers
+from bidnerf_core.mapping import LandmarkMap, Landmarks, Sights, States, point_variance
+
+RADII = (3.0, 1.5)
+"""Radii of the rounds of matching by projection, in units of the inlier threshold."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mode:
+    """A place or a mirror image that may explain the query, with the matches that agree with this hypothesis."""
+
+    name: str
+    query: QueryKeypoints
+    by_descriptors: Matches  # found by descriptors alone
+    matches: Matches
+    mirrored: bool = False  # whether ``query`` is the mirror image
+
+
+def term_of(modes: Sequence[Mode], best: States, landmarks: LandmarkMap, device: torch.device) -> Landmarks:
+    """Return the reprojection errors of the modes' matches, padded to equal length; ``best`` (g) are the modes' states.
+
+    On an accelerator, sizes are multiples of 256, so that few CUDA graphs are captured.
+    """
+    parts, size = [], max(len(mode.matches) for mode in modes)
+    size = size if device.type == "cpu" else -(-size // 256) * 256
+    for number, mode in enumerate(modes):
+        count = len(mode.matches)
+        index = torch.arange(size)
+        query, some = mode.query, mode.matches[index.clamp(max=count - 1)]
+        focal, sights = query.focal[some.keypoint], query.sights[some.keypoint]
+        points = landmarks.positions[some.landmark].double()
+        variance = point_variance(landmarks, some.landmark, best[number : number + 1], focal)
+        of_sights = sights.image, sights.times, sights.rotation, sights.translation
+        parts.append((points, *of_sights, (index < count).double(), variance, focal))
+    points, image, times, R, t, valid, variance, focal = (torch.stack(x) for x in zip(*parts, strict=True))
+    counts = [landmarks.correlation_of(len(mode.matches)) for mode in modes]
+    correlation, query = torch.tensor(counts, dtype=torch.float64), modes[0].query
+    sights = Sights(image, times, R, t, query.sights.single)
+    return Landmarks(
+        points, sights, valid, variance, focal, correlation, 1 / correlation, query.area, query.threshold / 2
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ModeSearch:
+    """Finds the modes at a proposal, and refines each under all explanations on matches by projection."""
+
+    query: QueryKeypoints
+    matcher: LandmarkMatcher
+    given: Explanations
+    device: torch.device
+
+    def __call__(self, nearest: Nearest, proposal: Proposal, nfa: float, searched: bool) -> tuple[list[Mode], States]:
+        """Return the modes and the most probable state of each mode; no mode if too few matches agree with the proposal.
+
+        ``nfa`` is log10 of the number of false alarms of the proposal. If the proposal was ``searched`` for among the matches by
+        descriptors, those that agree with it are used at first; otherwise, landmarks are matched by projection.
+        """
+        first = self._agreeing(Mode(proposal.name, self.query, nearest.best, nearest.best), proposal, searched)
+        if first is None:
+            return [], States.known(proposal.T, proposal.camera)
+        if searched:
+            first = first[0], self._warped(first[0], proposal, first[1])
+        others = (self._agreeing(mode, there, True) for mode, there in self._others(nearest, nfa, first[1]))
+        modes, best = map(list, zip(first, *(other for other in others if other is not None), strict=True))
+        seen: list[Projected | None] = [None] * len(modes)
+        for radius in RADII:
+            for g, mode in enumerate(modes):
+                within = radius * mode.query.threshold
+                seen[g] = projected = Projected(mode.query, self.matcher.landmarks, best[g], within, seen[g])
+                matches = projected.matches(within)
+                if len(matches) >= LEAST_AGREEING:
+                    modes[g] = mode = replace(mode, matches=matches)
+                if radius == RADII[0]:
+                    points = self.matcher.landmarks.positions[mode.matches.landmark].double()
+                    distance = float(best[g].T.inverse().apply(points).norm(dim=-1).median())
+                    again = Proposal(mode.name, best[g].T[0], best[g].nuisances[0, :6], distance)
+                    best[g] = self._compared(mode, again, float(best[g].noise))
+                best[g] = run_on(self.device, refine, best[g], self._term(mode, best[g]))
+        return modes, States.cat([replace(state, mode=state.mode + g) for g, state in enumerate(best)])
+
+    def _agreeing(self, mode: Mode, proposal: Proposal, searched: bool) -> tuple[Mode, States] | None:
+        """Return a mode with the matches that agree with a proposal, and its most probable state; None if too few agree."""
+        known, within = States.known(proposal.T, proposal.camera), RADII[0] * mode.query.threshold
+        if searched:
+            near = inliers(mode.query, self.matcher.landmarks, mode.by_descriptors, known, RADII[0])
+            matches = mode.by_descriptors[near]
+        else:
+            matches = Projected(mode.query, self.matcher.landmarks, known, within).matches(within)
+        if len(matches) < LEAST_AGREEING:
+            return None
+        mode = replace(mode, matches=matches)
+        return mode, self._compared(mode, proposal, mode.query.threshold / 2)
+
+    def _compared(self, mode: Mode, proposal: Proposal, noise: float) -> States:
+        """Return the most probable state of a mode among the kinds of cameras, each with its own noise, using a subset of the matches."""
+        count = len(mode.matches)
+        # At most a hundred matches are compared, evenly spread.
+        some = torch.linspace(0, count - 1, min(count, 100)).long()
+        states = self.given.first(proposal, 0, noise)
+        term = self._term(replace(mode, matches=mode.matches[some]), states[:1])
+        term = replace(term, share=term.share * (count / len(some)))
+        return run_on(self.device, most_probable, states, term)
+
+    def _warped(self, mode: Mode, proposal: Proposal, best: States) -> States:
+        """Return the fit of a camera that explains any warp of the image if many more matches agree with that fit, else ``best``.
+
+        In a sheared image, or a photo of a picture, consensus finds only the matches that happen to agree with a usual camera. From
+        that pose, the fit to all matches is graduated: at first, residuals as large as the warp still count (Blake and Zisserman 1987).
+        """
+        query, found = mode.query, mode.by_descriptors
+        agreeing = int(inliers(query, self.matcher.landmarks, found, best).sum())
+        if agreeing >= 0.7 * len(found):
+            return best
+        states = self.given.first(proposal, 0, query.threshold / 2)
+        state = states[(states.row == self.given.widest).nonzero()[:, 0]]
+        state = run_on(self.device, graduate, state, self._term(replace(mode, matches=found), best))
+        more = int(inliers(query, self.matcher.landmarks, found, state).sum())
+        return state if more > 1.3 * agreeing else best
+
+    def _others(self, nearest: Nearest, nfa: float, best: States) -> Iterator[tuple[Mode, Proposal]]:
+        """Yield the hypotheses that compete with the place of the state ``best``.
+
+        A scene may be repetitive, such as two rooms with the same furniture: keypoints that agree with the state may agree as well with
+        similar landmarks elsewhere. The image may also be mirrored. No hypotheses are tried unless a first pose, even a wrong one, agrees
+        with at least ``LEAST_AGREEING`` matches of the image as it is.
+        """
+        query, landmarks, modes = self.query, self.matcher.landmarks, list[Mode]()
+        q, k = nearest.landmark.shape
+        every = Matches(nearest.keypoint.repeat_interleave(k), nearest.landmark.flatten())
+        near = inliers(query, landmarks, every, best, RADII[0]).view(q, k)
+        agreeing = torch.zeros(len(query.view), dtype=torch.bool)
+        agreeing[nearest.keypoint] = near[:, 0]
+        others = nearest.others(near)
+        others = others[agreeing[others.keypoint]]
+        # Another place has at least three tenths as many inliers as the first.
+        if len(others.keypoint.unique()) >= max(LEAST_AGREEING, 0.3 * int(agreeing.sum())):
+            modes.append(Mode("another place", query, others, others))
+        # A pose with fewer than 1e-150 false alarms is unmistakable, so no mirror image is tried.
+        if nfa > -150.0 and landmarks.features == "sift" and len(query.images) == 1:
+            matches = Nearest.of(query.mirrored, self.matcher, STRONGEST).best
+            modes.append(Mode("mirror image", query.mirrored, matches, matches, mirrored=True))
+        for mode in modes:
+            other = consensus(mode.query, landmarks, mode.by_descriptors, best.nuisances[0, :6], mode.name)
+            if other is not None:
+                yield mode, other[0]
+
+    def _term(self, mode: Mode, state: States) -> Landmarks:
+        return term_of([mode], state, self.matcher.landmarks, self.device)
