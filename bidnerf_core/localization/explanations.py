@@ -97,19 +97,22 @@ class Explanations:
         return torch.tensor([camera in USUAL for camera in self.cameras])
 
     @property
+    def distinct(self) -> Bool[Tensor, "k"]:
+        """Mask of the explanations that differ clearly from all others; if there are none, of all."""
+        similar = torch.tensor([camera in ("exact", "inexact", "map") for camera in self.cameras])
+        return ~similar | similar.all()
+
+    @property
     def widest(self) -> int:
         """The index of the static explanation that leaves the camera the most freedom."""
         return int((self.deviation[:, :6].sum(-1) - self.deviation[:, 6:12].sum(-1)).argmax())
 
     def first(self, proposal: Proposal, mode: int, noise: float) -> States:
-        """Return the initial states of the search: one for each kind of camera, and one with the stated camera in motion.
+        """Return the initial states of the search: one for each distinct camera, and one with the stated camera in motion.
 
         If the focal length or the principal point changes, the camera is moved along its axis and turned to keep about the same view.
         """
-        # These three are not tried by themselves at first, since they are similar to others.
-        kinds = torch.tensor([camera not in ("exact", "inexact", "map") for camera in self.cameras])
-        kinds |= ~kinds.any()
-        still, moving = ((kinds & which).nonzero()[:, 0] for which in (~self.moves, self.moves))
+        still, moving = ((self.distinct & which).nonzero()[:, 0] for which in (~self.moves, self.moves))
         row = torch.cat([still, moving[:1]])
         k, mean, deviation = len(row), self.mean[row], self.deviation[row]
         z = torch.zeros((k, N), dtype=torch.float64)

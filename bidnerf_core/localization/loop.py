@@ -41,6 +41,7 @@ from bidnerf_core.localization.posterior import (
     fit_modes,
     fit_noise,
     fit_with_rays,
+    refine_with_rays,
     weigh,
 )
 from bidnerf_core.localization.problem import Problem, extent_of
@@ -200,7 +201,7 @@ class Loop:
             fused.append("depth")
             fit = run_on(self.device, fit_modes, best, terms, given, 5)
             fit = replace(fit, log_odds=-run_on(self.device, cost_of, points, fit.about))
-            best, found = fit.about, self._posterior(fit, landmarks)
+            found = self._posterior(fit, landmarks)
             near, both = run_on(self.device, agreement, points, found.chosen)
             others |= {"on_surface": float(near), "colour_inliers": float(both)}
         answer = self._judged(found, modes, landmarks, given, searched, others)
@@ -215,7 +216,7 @@ class Loop:
         where = "cpu" if self.problem.device == self.device else None
         views, field, bounds = self.problem.views, self.problem.field, self.problem.bounds
         rays = RenderedRays.of(views, field, bounds, self.rays, self.seed, device=where, steep=True)
-        best = self._begin_with_rays(found, fit.states, best, rays, given, which, blur)
+        best = self._begin_with_rays(found, fit, terms, rays, given, which, blur)
         for _ in range(3):  # as above
             row = best.row
             fit = run_on(self.device, fit_with_rays, best, terms, rays, given, which)
@@ -259,30 +260,35 @@ class Loop:
     def _begin_with_rays(
         self,
         found: Posterior,
-        states: States,
-        best: States,
+        fit: Fit,
+        terms: list[CostTerm],
         rays: RenderedRays,
         given: Explanations,
         which: Tensor,
         blur: float,
     ) -> States:
-        """Return ``best`` with the state of each mode ``which`` from which the descent with rays begins.
+        """Return the states of the modes, those ``which`` refined with some of the rays; all rays are then fitted from there.
 
-        It is the camera with which some rays agree best, of the most probable ones. The pose of a camera at rest that may be as stated
-        is first refined on small images where rays would be too fine (``blur`` is in pixels).
+        The refinement begins at the most probable explanation with which these rays agree best. The pose of a camera at rest that may be
+        as stated is first refined on small images where rays would be too fine (``blur`` is in pixels). If the rays agree clearly less
+        than usual, each kind of camera is refined, and the most probable one is chosen.
         """
-        problem = self.problem
-        assert problem is not None
+        assert self.problem is not None
         likely = found.probability.argsort(descending=True)[:8]
-        some, few = states[likely], rays.first(256)
+        some, few, best = fit.states[likely], rays.first(256), fit.likeliest
         loss = few.loss_at(some)
         score = found.probability[likely].log() - Images.INDEPENDENT * loss
         for g in which:
             first = torch.where(some.mode == g, score, -torch.inf).argmax()[None]
             here = some[first]
             if bool((given.usual & ~given.moves)[here.row]):
-                coarse = refine_on_small_images(problem, here, blur)
+                coarse = refine_on_small_images(self.problem, here, blur)
                 here = coarse if float(few.loss_at(coarse)) < float(loss[first]) else here
+            here = run_on(self.device, refine_with_rays, here, terms, few)
+            kinds = fit.states[(fit.states.mode == g) & (given.distinct & ~given.moves)[fit.states.row]]
+            # On record, three of four right poses have rays that agree better.
+            if float(few.loss_at(here)) > 1.3 * self.landmarks.trial.difference > 0 and len(kinds):
+                here = run_on(self.device, refine_with_rays, States.cat([here, kinds]), terms, few)
             best = best.with_rows(g[None], here)
         return best
 

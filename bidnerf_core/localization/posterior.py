@@ -16,6 +16,7 @@ from torch import Tensor
 from bidnerf_core.devices import move_to, run_on
 from bidnerf_core.geometry import KEYPOINTS_PER_INDEPENDENT, SE3
 from bidnerf_core.localization.explanations import Explanations
+from bidnerf_core.localization.terms.images import Images
 from bidnerf_core.localization.terms.rays import RenderedRays
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.mapping import (
@@ -303,6 +304,13 @@ def linearize_modes(best: States, terms: Sequence[CostTerm], given: Explanations
 def fit_landmarks(best: States, term: Landmarks, given: Explanations) -> Fit:
     """Fit the landmarks with newly estimated noise."""
     return fit_modes(term.with_noise(best), [term], given, 4)
+
+
+def refine_with_rays(states: States, terms: Sequence[CostTerm], rays: RenderedRays) -> States:
+    """Refine states with rays, and return the most probable one; between them, rays count as whole images do."""
+    states, _ = descend(states, [*terms, rays.fitted(states)], 8)
+    loss = rays.loss_at(states)
+    return states[(states.log_prior - total(states, terms).cost - Images.INDEPENDENT * loss).argmax()[None]]
 
 
 def fit_with_rays(

@@ -222,8 +222,8 @@ def refine_on_small_images(problem: Problem, state: States, blur: float) -> Stat
     ]
     renderer = field_renderer(problem.field, problem.bounds)
     width = max(32.0, max(max(camera.width, camera.height) for camera in cameras) / blur)
-    while width <= 128:
+    while width <= 96:
         thumbnails = [move_to(Thumbnail.of(view, round(width)), problem.device) for view in views]
-        state, _ = descend(state, [Images(renderer, thumbnails)], 5)
+        state, _ = descend(state, [Images(renderer, thumbnails)], 3)
         width *= 2
     return state
