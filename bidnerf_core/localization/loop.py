@@ -216,13 +216,8 @@ class Loop:
         where = "cpu" if self.problem.device == self.device else None
         views, field, bounds = self.problem.views, self.problem.field, self.problem.bounds
         rays = RenderedRays.of(views, field, bounds, self.rays, self.seed, device=where, steep=True)
-        best = self._begin_with_rays(found, fit, terms, rays, given, which, blur)
-        for _ in range(3):  # as above
-            row = best.row
-            fit = run_on(self.device, fit_with_rays, best, terms, rays, given, which)
-            best = fit.likeliest
-            if torch.equal(best.row[which], row[which]):
-                break
+        fit = self._fit_rays(found, fit, terms, rays, given, which, blur)
+        best = fit.likeliest
         loss = fit.loss
         for g in set(places) - set(which.tolist()):
             loss[g] = replace(rays, sights=rays.sights.mirrored).loss_at(best[g : g + 1])[0]
@@ -257,7 +252,7 @@ class Loop:
             return None
         return replace(points, noise=noise, independent=points.independent / self.landmarks.trial.points)
 
-    def _begin_with_rays(
+    def _fit_rays(
         self,
         found: Posterior,
         fit: Fit,
@@ -266,12 +261,12 @@ class Loop:
         given: Explanations,
         which: Tensor,
         blur: float,
-    ) -> States:
-        """Return the states of the modes, those ``which`` refined with some of the rays; all rays are then fitted from there.
+    ) -> Fit:
+        """Fit rays as well, for the modes ``which``; ``fit`` and its posterior ``found`` are without them.
 
-        The refinement begins at the most probable explanation with which these rays agree best. The pose of a camera at rest that may be
-        as stated is first refined on small images where rays would be too fine (``blur`` is in pixels). If the rays agree clearly less
-        than usual, each kind of camera is refined, and the most probable one is chosen.
+        The descent begins at the camera with which some rays agree best, of the most probable ones. The pose of a camera at rest that may
+        be as stated is first refined on small images where rays would be too fine (``blur`` is in pixels). Where the rays agree clearly
+        less than usual, it begins again at each distinct camera.
         """
         assert self.problem is not None
         likely = found.probability.argsort(descending=True)[:8]
@@ -284,13 +279,30 @@ class Loop:
             if bool((given.usual & ~given.moves)[here.row]):
                 coarse = refine_on_small_images(self.problem, here, blur)
                 here = coarse if float(few.loss_at(coarse)) < float(loss[first]) else here
-            here = run_on(self.device, refine_with_rays, here, terms, few)
-            kinds = fit.states[(fit.states.mode == g) & (given.distinct & ~given.moves)[fit.states.row]]
-            # On record, three of four right poses have rays that agree better.
-            if float(few.loss_at(here)) > 1.3 * self.landmarks.trial.difference > 0 and len(kinds):
-                here = run_on(self.device, refine_with_rays, States.cat([here, kinds]), terms, few)
             best = best.with_rows(g[None], here)
-        return best
+        with_rays = self._settle(best, terms, rays, given, which)
+        # On record, three of four right poses have rays that agree better.
+        agrees = with_rays.loss <= 1.3 * self.landmarks.trial.difference
+        if self.landmarks.trial.difference == 0 or bool(agrees[which].all()):
+            return with_rays
+        best = with_rays.likeliest
+        for g in which[~agrees[which]]:
+            cameras = fit.states[(fit.states.mode == g) & (given.distinct & ~given.moves)[fit.states.row]]
+            starts = States.cat([best[g[None]], cameras])
+            best = best.with_rows(g[None], run_on(self.device, refine_with_rays, starts, terms, few))
+        again = self._settle(best, terms, rays, given, which)
+        return again if float(again.loss[which].amin()) < float(with_rays.loss[which].amin()) else with_rays
+
+    def _settle(
+        self, best: States, terms: list[CostTerm], rays: RenderedRays, given: Explanations, which: Tensor
+    ) -> Fit:
+        """Return up to three fits, until the explanation that a mode is linearized about is its most probable one."""
+        for _ in range(3):
+            fit = run_on(self.device, fit_with_rays, best, terms, rays, given, which)
+            row, best = best.row, fit.likeliest
+            if torch.equal(best.row[which], row[which]):
+                break
+        return fit
 
     def _posterior(self, fit: Fit, landmarks: Landmarks) -> Posterior:
         """Return the posterior over the explanations; of two places that look the same, the one nearer to the start is likelier."""

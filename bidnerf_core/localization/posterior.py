@@ -6,8 +6,8 @@ The module also holds the steps of the loop that depend on tensors alone; a GPU 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -49,8 +49,8 @@ class Fit:
     weights: Float[Tensor, "h"]  # log evidence for each explanation
     # mean loss of the rays of each mode, in squares of their scale, and Hessians of the rays alone, in the units of the models;
     # NaN and 0 where none were rendered
-    loss: Float[Tensor, "g"] = field(default_factory=partial(torch.zeros, 0))
-    by_rays: Float[Tensor, "g P P"] = field(default_factory=partial(torch.zeros, 0, P, P))
+    loss: Float[Tensor, "g"]
+    by_rays: Float[Tensor, "g P P"]
     log_odds: Float[Tensor, "g"] | float = 0.0  # between the modes, from measurements other than landmarks
     # scatter of the gradients of each state (in the units of the models) beyond that of independent errors
     systematic: Float[Tensor, "h P P"] | float = 0.0
@@ -291,7 +291,8 @@ def fit_modes(best: States, terms: Sequence[CostTerm], given: Explanations, step
     about, _ = descend(best, terms, steps)
     quadratic = linearize_modes(about, terms, given)
     states, normal = quadratic.minimum(given.about(quadratic.here))
-    return Fit(about, quadratic, states, normal, log_evidence(states, normal))
+    none = torch.full_like(quadratic.cost, torch.nan), torch.zeros_like(quadratic.hessian)
+    return Fit(about, quadratic, states, normal, log_evidence(states, normal), *none)
 
 
 def linearize_modes(best: States, terms: Sequence[CostTerm], given: Explanations) -> Quadratic:

@@ -44,6 +44,7 @@ SOUND = Evidence(
     mass=1.0,
     searched=True,
 )
+COUNTS = ("inliers", "inliers_alone", "mirrored")
 UNSURE, SURE = LogisticModel({}, -1.0), LogisticModel({}, 8.0)
 LEVELS = {"risk": {"least_confidence": [[0.01, 0.97], [0.05, 0.9], [0.1, 0.8]]}}
 
@@ -59,6 +60,8 @@ def beyond(bound: Bound, by: float) -> Evidence:
     value = bound.limit - by if bound.is_least else bound.limit + by
     if bound.measure == "above_chance":
         return replace(SOUND, by_chance=(1 + SOUND.inliers) / value - 1)
+    if bound.measure.startswith("inliers"):
+        return replace(SOUND, inliers=value, difference=1.0 if bound.measure == "inliers" else None)
     return replace(SOUND, **{bound.measure: value})
 
 
@@ -70,7 +73,7 @@ def test_what_keeps_all_bounds_is_accepted() -> None:
 
 @pytest.mark.parametrize("bound", LANDMARK_BOUNDS, ids=lambda bound: bound.measure)
 def test_each_bound_alone_rejects_with_its_outcome_and_reason(bound: Bound) -> None:
-    step = 1 if bound.measure == "inliers" else 1e-3 * abs(bound.limit)
+    step = 1 if bound.measure in COUNTS else 1e-3 * abs(bound.limit)
     within, out = judge(beyond(bound, -step)), judge(beyond(bound, step))
     assert within.accepted, within.reason
     assert out.outcome is bound.outcome
@@ -81,7 +84,7 @@ def test_each_bound_alone_rejects_with_its_outcome_and_reason(bound: Bound) -> N
 
 @pytest.mark.parametrize("bound", LANDMARK_BOUNDS, ids=lambda bound: bound.measure)
 def test_what_is_not_a_number_is_not_accepted(bound: Bound) -> None:
-    if bound.measure != "inliers":
+    if bound.measure not in COUNTS:
         name = "by_chance" if bound.measure == "above_chance" else bound.measure
         assert not judge(replace(SOUND, **{name: math.nan})).accepted
 
@@ -90,7 +93,7 @@ def test_of_several_reasons_the_most_serious_is_stated() -> None:
     for one, other in pairwise(LANDMARK_BOUNDS):
         both = {
             field.name: getattr(part, field.name)
-            for part in (beyond(other, 1e-3), beyond(one, 1 if one.measure == "inliers" else 1e-3))
+            for part in (beyond(other, 1e-3), beyond(one, 1 if one.measure in COUNTS else 1e-3))
             for field in fields(Evidence)
             if getattr(part, field.name) != getattr(SOUND, field.name)
         }

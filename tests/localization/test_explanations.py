@@ -193,7 +193,7 @@ def test_only_a_single_image_may_be_moving_and_the_likelier_the_more_the_maps_im
     known = landmarks(PINHOLE, moving=share)
     single, rig = (explanations(query(*[PINHOLE] * n), known, 4.0, 0.02) for n in (1, 2))
     still = explanations(query(PINHOLE), known, 4.0, 0.02, moving=False)
-    assert not bool((rig.moves.any() | still.moves.any()))
+    assert not bool(rig.moves.any() | still.moves.any())
     moves = single.moves
     probability = float(single.log_prior.softmax(0)[moves].sum())
     assert probability == pytest.approx(0.8 if share else 1 / 30)

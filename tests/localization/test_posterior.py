@@ -12,8 +12,8 @@ from torch import Generator, Tensor
 from bidnerf import SE3
 from bidnerf_core.localization import Posterior
 
-# Inside: the tolerance, relative to which the distances of the scene are varied
-from bidnerf_core.localization.posterior import TOLERANCE
+# Inside: the tolerance, relative to which the distances of the scene are varied, and a fit of terms in closed form
+from bidnerf_core.localization.posterior import TOLERANCE, Fit
 from bidnerf_core.mapping import (
     NUISANCES,
     Landmarks,
@@ -21,6 +21,7 @@ from bidnerf_core.mapping import (
     Sights,
     States,
     descend,
+    log_evidence,
     prior,
     project,
     total,
@@ -63,6 +64,13 @@ def matches(seed: int, outliers: float = 0.0, nuisances: Tensor | None = None, m
     return Landmarks(points, seen, one, 0 * one, FOCAL * one, each, each, 400 * 300.0, 5.0)
 
 
+def fitted(quadratic: Quadratic, given: States) -> Fit:
+    """Return the fit of models under some explanations, without rays."""
+    states, normal = quadratic.minimum(given)
+    none = torch.full_like(quadratic.cost, torch.nan), torch.zeros_like(quadratic.hessian)
+    return Fit(quadratic.here, quadratic, states, normal, log_evidence(states, normal), *none)
+
+
 def solved(
     term: Landmarks, wide: Tensor | None = None, scatter: Tensor = NO_SCATTER, explained: States | None = None
 ) -> Posterior:
@@ -77,8 +85,7 @@ def solved(
     quadratic = Quadratic.of(total(wider, [term]) - prior(wider), wider)
     given = free if explained is None else explained
     index = torch.zeros(len(given), dtype=torch.long)
-    minimum = quadratic.minimum(replace(given, T=found.T[index], noise=found.noise[index]))
-    return Posterior.of(*minimum, quadratic, term, scatter)
+    return Posterior.of(fitted(quadratic, replace(given, T=found.T[index], noise=found.noise[index])), term, scatter)
 
 
 def squared_errors(posteriors: list[Posterior]) -> Tensor:
@@ -200,8 +207,7 @@ def test_prior_odds_and_evidence_of_landmarks_decide_between_places() -> None:
         modes, _ = descend(modes, [given], 8)
         quadratic = Quadratic.of(total(modes, [given]) - prior(modes), modes)
         log_odds = torch.tensor([0.0, odds], dtype=torch.float64)
-        minimum = quadratic.minimum(modes)
-        found = Posterior.of(*minimum, quadratic, given, NO_SCATTER, log_odds=log_odds)
+        found = Posterior.of(replace(fitted(quadratic, modes), log_odds=log_odds), given, NO_SCATTER)
         probability[name] = float(found.probability[found.states.mode == 1].sum())
         assert bool((found.place(1).translation - modes.T[1].translation).norm() < 0.05)
     assert probability["alike"] == pytest.approx(0.5, abs=1e-3)
