@@ -115,6 +115,7 @@ MEASURES = {
         ".0f",
         "matched near where the pose predicts them, within three standard deviations",
     ),
+    "mirrored": ("mirrored", ".0f", "1 if the mirror image fits the map better than the image"),
     "above_chance": (
         "more than by chance",
         ".1f",

@@ -50,7 +50,7 @@ class Evidence:
     precision: float  # standard deviation of the position relative to the scene's distance
     mass: float  # probability that the pose is within the tolerance, and its camera credible
     searched: bool  # whether the pose was found by landmarks, not only confirmed by them
-    mirrored: bool = False  # whether the mirror image was localized
+    mirrored: bool | None = None  # true if the mirror image was localized
     on_surface: float | None = None  # fraction of the measured points on the surface
     colour_inliers: float | None = None  # fraction of the measured points on the surface and with its colour
     # mean robust loss of the rays relative to the usual one of the map's own images; None if no rays were rendered
@@ -62,14 +62,11 @@ class Evidence:
         return (1 + self.inliers) / (1 + self.by_chance)
 
     @property
-    def inliers_alone(self) -> float | None:
-        """The number of inliers if no rays were rendered, which confirm or contradict what few inliers show."""
-        return self.inliers if self.difference is None else None
-
-    @property
     def bounds(self) -> Iterator[tuple[Bound, float]]:
         """The bounds of ``LANDMARK_BOUNDS`` on the measures that were taken, each paired with the value of its measure."""
         for bound in LANDMARK_BOUNDS if self.searched else LANDMARK_BOUNDS[1:]:
+            if self.difference is not None and bound.with_rays is not None:
+                bound = bound._replace(limit=bound.with_rays)
             if (value := getattr(self, bound.measure)) is not None:
                 yield bound, value
 
@@ -93,6 +90,9 @@ class Bound(NamedTuple):
     outcome: Outcome
     reason: str  # with the value as ``{0}``, and the limit as ``{1}``
     is_open: bool = False  # whether rendered rays may change the measure
+    with_rays: float | None = (
+        None  # the limit if rays were rendered, which confirm or contradict what the measure shows
+    )
 
     def keeps(self, value: float) -> bool:
         """Return whether a value satisfies the limit; NaN never does."""
@@ -101,8 +101,7 @@ class Bound(NamedTuple):
 
 LANDMARK_BOUNDS = (
     Bound("log10_nfa", -12.0, False, Outcome.TOO_FEW_MATCHES, "{0:.0e} poses as good are expected by chance"),
-    Bound("inliers", 10, True, Outcome.TOO_FEW_MATCHES, "only {0:.0f} landmark inliers", True),
-    Bound("inliers_alone", 15, True, Outcome.TOO_FEW_MATCHES, "only {0:.0f} landmark inliers", True),
+    Bound("inliers", 15, True, Outcome.TOO_FEW_MATCHES, "only {0:.0f} landmark inliers", True, 10),
     Bound("mirrored", 0, False, Outcome.MIRRORED, "the mirror image fits the map better than the image", True),
     Bound("above_chance", 3.0, True, Outcome.AMBIGUOUS, "only {0:.1f} times as many landmarks match as by chance"),
     Bound("spread", 0.06, True, Outcome.UNDETERMINED, "the landmarks are all in {0:.0%} of the image"),

@@ -355,7 +355,7 @@ class Loop:
             precision=min(position / distance, 1.0),
             mass=found.mass(distance, self.landmarks.pose_covariance, given.credible[row]),
             searched=searched,
-            mirrored=mode.mirrored,
+            mirrored=mode.mirrored or None,
             **others,
         )
         # Many landmarks are visible, and hardly more match than by chance.

@@ -44,7 +44,7 @@ SOUND = Evidence(
     mass=1.0,
     searched=True,
 )
-COUNTS = ("inliers", "inliers_alone", "mirrored")
+COUNTS = ("inliers", "mirrored")
 UNSURE, SURE = LogisticModel({}, -1.0), LogisticModel({}, 8.0)
 LEVELS = {"risk": {"least_confidence": [[0.01, 0.97], [0.05, 0.9], [0.1, 0.8]]}}
 
@@ -60,8 +60,6 @@ def beyond(bound: Bound, by: float) -> Evidence:
     value = bound.limit - by if bound.is_least else bound.limit + by
     if bound.measure == "above_chance":
         return replace(SOUND, by_chance=(1 + SOUND.inliers) / value - 1)
-    if bound.measure.startswith("inliers"):
-        return replace(SOUND, inliers=value, difference=1.0 if bound.measure == "inliers" else None)
     return replace(SOUND, **{bound.measure: value})
 
 
@@ -87,6 +85,11 @@ def test_what_is_not_a_number_is_not_accepted(bound: Bound) -> None:
     if bound.measure not in COUNTS:
         name = "by_chance" if bound.measure == "above_chance" else bound.measure
         assert not judge(replace(SOUND, **{name: math.nan})).accepted
+
+
+@pytest.mark.parametrize(("inliers", "difference", "accepted"), [(12, None, False), (12, 1.0, True), (9, 1.0, False)])
+def test_fewer_inliers_suffice_where_rays_confirm_them(inliers: int, difference: float | None, accepted: bool) -> None:
+    assert judge(replace(SOUND, inliers=inliers, difference=difference)).accepted is accepted
 
 
 def test_of_several_reasons_the_most_serious_is_stated() -> None:
