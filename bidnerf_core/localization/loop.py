@@ -33,7 +33,7 @@ from bidnerf_core.localization.matching import (
 )
 from bidnerf_core.localization.modes import RADII, Mode, ModeSearch, term_of
 from bidnerf_core.localization.posterior import (
-    Fit,
+    ModeFits,
     Posterior,
     agreement,
     cost_of,
@@ -255,14 +255,14 @@ class Loop:
     def _fit_rays(
         self,
         found: Posterior,
-        fit: Fit,
+        fit: ModeFits,
         terms: list[CostTerm],
         rays: RenderedRays,
         given: Explanations,
         which: Tensor,
         blur: float,
-    ) -> Fit:
-        """Fit rays as well, for the modes ``which``; ``fit`` and its posterior ``found`` are without them.
+    ) -> ModeFits:
+        """ModeFits rays as well, for the modes ``which``; ``fit`` and its posterior ``found`` are without them.
 
         The descent begins at the camera with which some rays agree best, of the most probable ones. The pose of a camera at rest that may
         be as stated is first refined on small images where rays would be too fine (``blur`` is in pixels). Where the rays agree clearly
@@ -295,7 +295,7 @@ class Loop:
 
     def _settle(
         self, best: States, terms: list[CostTerm], rays: RenderedRays, given: Explanations, which: Tensor
-    ) -> Fit:
+    ) -> ModeFits:
         """Return up to three fits, until the explanation that a mode is linearized about is its most probable one."""
         for _ in range(3):
             fit = run_on(self.device, fit_with_rays, best, terms, rays, given, which)
@@ -304,7 +304,7 @@ class Loop:
                 break
         return fit
 
-    def _posterior(self, fit: Fit, landmarks: Landmarks) -> Posterior:
+    def _posterior(self, fit: ModeFits, landmarks: Landmarks) -> Posterior:
         """Return the posterior over the explanations; of two places that look the same, the one nearer to the start is likelier."""
         if self.problem is not None and (start := self.problem.start) is not None:
             update = (start.inverse() @ fit.quadratic.here.T).log()

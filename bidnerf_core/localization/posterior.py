@@ -39,7 +39,7 @@ TOLERANCE = 0.03
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class ModeFits:
     """All terms fitted under each explanation (h) of each mode (g), by quadratic models about the modes' states."""
 
     about: States  # (g)
@@ -76,7 +76,7 @@ class Posterior:
 
     @staticmethod
     def of(
-        fit: Fit,
+        fit: ModeFits,
         landmarks: Landmarks,
         scatter: Float[Tensor, "4"],
         device: torch.device = torch.device("cpu"),  # noqa: B008
@@ -286,13 +286,13 @@ def weigh(states: States, term: Landmarks) -> tuple[States, Landmarks]:
     return states, term.weighted_for(states)
 
 
-def fit_modes(best: States, terms: Sequence[CostTerm], given: Explanations, steps: int) -> Fit:
+def fit_modes(best: States, terms: Sequence[CostTerm], given: Explanations, steps: int) -> ModeFits:
     """Refine the state of each mode (g), and minimize the models about these states under each explanation."""
     about, _ = descend(best, terms, steps)
     quadratic = linearize_modes(about, terms, given)
     states, normal = quadratic.minimum(given.about(quadratic.here))
     none = torch.full_like(quadratic.cost, torch.nan), torch.zeros_like(quadratic.hessian)
-    return Fit(about, quadratic, states, normal, log_evidence(states, normal), *none)
+    return ModeFits(about, quadratic, states, normal, log_evidence(states, normal), *none)
 
 
 def linearize_modes(best: States, terms: Sequence[CostTerm], given: Explanations) -> Quadratic:
@@ -302,8 +302,8 @@ def linearize_modes(best: States, terms: Sequence[CostTerm], given: Explanations
     return Quadratic.of(total(free, terms) - prior(free), free)
 
 
-def fit_landmarks(best: States, term: Landmarks, given: Explanations) -> Fit:
-    """Fit the landmarks with newly estimated noise."""
+def fit_landmarks(best: States, term: Landmarks, given: Explanations) -> ModeFits:
+    """ModeFits the landmarks with newly estimated noise."""
     return fit_modes(term.with_noise(best), [term], given, 4)
 
 
@@ -316,8 +316,8 @@ def refine_with_rays(states: States, terms: Sequence[CostTerm], rays: RenderedRa
 
 def fit_with_rays(
     best: States, terms: Sequence[CostTerm], rays: RenderedRays, given: Explanations, which: Int[Tensor, "r"]
-) -> Fit:
-    """Fit the terms, and for the modes ``which`` also rays, which are too expensive to be rendered for all explanations."""
+) -> ModeFits:
+    """ModeFits the terms, and for the modes ``which`` also rays, which are too expensive to be rendered for all explanations."""
     rays = rays.fitted(best[which])
     here, _ = descend(best[which], [*terms, rays], 4)
     about = best.with_rows(which, here)
@@ -331,7 +331,7 @@ def fit_with_rays(
     weights = weights + (1 - 1 / KEYPOINTS_PER_INDEPENDENT) * (quadratic(states).cost - plain(states).cost)
     loss = torch.full_like(quadratic.cost, torch.nan).index_copy(0, which, compared.loss().to(best.z))
     hessian = torch.zeros_like(quadratic.hessian).index_add(0, which, by_rays.hessian)
-    return Fit(about, quadratic, states, normal, weights, loss, hessian)
+    return ModeFits(about, quadratic, states, normal, weights, loss, hessian)
 
 
 def cost_of(points: Surface, states: States) -> Float[Tensor, "h"]:

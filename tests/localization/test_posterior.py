@@ -13,7 +13,7 @@ from bidnerf import SE3
 from bidnerf_core.localization import Posterior
 
 # Inside: the tolerance, relative to which the distances of the scene are varied, and a fit of terms in closed form
-from bidnerf_core.localization.posterior import TOLERANCE, Fit
+from bidnerf_core.localization.posterior import TOLERANCE, ModeFits
 from bidnerf_core.mapping import (
     NUISANCES,
     Landmarks,
@@ -64,11 +64,11 @@ def matches(seed: int, outliers: float = 0.0, nuisances: Tensor | None = None, m
     return Landmarks(points, seen, one, 0 * one, FOCAL * one, each, each, 400 * 300.0, 5.0)
 
 
-def fitted(quadratic: Quadratic, given: States) -> Fit:
+def fitted(quadratic: Quadratic, given: States) -> ModeFits:
     """Return the fit of models under some explanations, without rays."""
     states, normal = quadratic.minimum(given)
     none = torch.full_like(quadratic.cost, torch.nan), torch.zeros_like(quadratic.hessian)
-    return Fit(quadratic.here, quadratic, states, normal, log_evidence(states, normal), *none)
+    return ModeFits(quadratic.here, quadratic, states, normal, log_evidence(states, normal), *none)
 
 
 def solved(
