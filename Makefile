@@ -9,6 +9,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 REQUIREMENTS := pyproject.toml constraints.txt
 DEMO_OUT := demo-out
+PAGE := bidnerf/viewer/page
 SHAPES := tests/testing/test_contract.py::TestHashGrid tests/cli/test_cli_bake.py::test_a_baked_map_needs_no_start
 # A process a core, of one thread each; a file's tests share fixtures, and conftest.py puts the longest files first.
 PARALLEL := -n logical --dist loadfile --no-loadscope-reorder
@@ -24,7 +25,7 @@ unexport PYTHONDONTWRITEBYTECODE
 INSTALL = $(BIN)/python -m pip install --disable-pip-version-check --no-compile -c constraints.txt
 SHOW_LONG = { grep --line-buffered -E 'Downloading .*(MB|GB)|^Installing collected' | cut -c1-100 || true; }
 
-.PHONY: help demo test slow robustness shapes check lint format types arrows wheels docs clean
+.PHONY: help demo test slow robustness shapes check lint format page types arrows wheels docs clean
 
 help: ## this list
 	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/^([a-z]+):[^#]*## /  make \1\t/' | expand -t 18
@@ -48,9 +49,11 @@ robustness: $(VENV)/.installed-dev ## hostile inputs, kills, full disks and crow
 
 check: lint types arrows ## everything that is checked without running the code
 
-lint: $(VENV)/.installed-dev ## style
+lint: $(VENV)/.installed-dev ## style, of Python and of JavaScript
 	@$(BIN)/ruff format --check --quiet --output-format concise || { echo "not formatted: run 'make format'"; exit 1; }
-	@$(BIN)/ruff check --quiet && echo "style: ok"
+	@$(BIN)/ruff check --quiet
+	@$(BIN)/oxfmt --check $(PAGE) >/dev/null || { echo "JavaScript is not formatted: run 'make format'"; exit 1; }
+	@$(BIN)/oxlint --deny-warnings --quiet $(PAGE) && echo "style: ok"
 
 types: $(VENV)/.installed-dev ## static types
 	@$(BIN)/mypy
@@ -65,12 +68,22 @@ wheels: $(VENV)/.installed-dev ## what is distributed, of bidnerf and of every p
 format: $(VENV)/.installed-dev ## put the code into shape
 	@$(BIN)/ruff check --fix --quiet || true
 	@$(BIN)/ruff format
+	@$(BIN)/oxfmt $(PAGE)
+
+# The last line says which sources were bundled, so that a test without Node.js finds a bundle that is out of date.
+page: ## the viewer's JavaScript as one file, by esbuild; needs Node.js, and is only needed after a change of it
+	@npm install --silent --no-audit --no-fund
+	@npm run --silent bundle -- --log-level=warning
+	@cd $(PAGE) && $(PYTHON) -c 'import glob, hashlib; \
+		sources = sorted(set(glob.glob("*.js")) - set(glob.glob("*.min.js"))); \
+		content = b"".join(open(name, "rb").read() for name in sources); \
+		print("// sources:", hashlib.sha256(content).hexdigest())' >>page.min.js
 
 docs: $(VENV)/.installed-docs ## the documentation as a web site, in site/
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict && echo "open site/index.html"
 
 clean: ## remove what these targets made
-	rm -rf $(VENV) $(DEMO_OUT) site build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks
+	rm -rf $(VENV) $(DEMO_OUT) node_modules site build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/pip:

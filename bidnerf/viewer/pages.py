@@ -27,9 +27,6 @@ from bidnerf_core.io import to_plain, write_file
 from bidnerf_core.localization import Localization, Localizer, SearchRecord, record_search
 from bidnerf_core.maps import Map
 
-MODULES = ("data", "space", "compare", "panel", "table", "track", "live", "main")
-"""The page's JavaScript modules, each after those that it imports. They share a scope, so their names must not clash."""
-
 
 @dataclass(frozen=True, eq=False)
 class MapView:
@@ -59,7 +56,7 @@ class MapView:
         """Return the whole page, whose content security policy allows only its own scripts and, if live, its own server."""
         # The characters that could end a script in a page or begin markup.
         escapes = str.maketrans({c: f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"})
-        library, scripts = _part("three.min.js"), _scripts()
+        library, scripts = _part("three.min.js"), _part("page.min.js")
         server = "'self'" if self.live else "'none'"
         policy = (
             f"default-src 'none'; img-src data: blob: 'self'; style-src 'unsafe-inline'; "
@@ -88,13 +85,6 @@ class MapView:
 @cache
 def _part(name: str) -> str:
     return files(__package__).joinpath("page", name).read_text(encoding="utf-8")
-
-
-@cache
-def _scripts() -> str:
-    """Return the JavaScript modules of the page, joined into one script."""
-    texts = "\n".join(_part(f"{name}.js") for name in MODULES).replace("\nexport ", "\n")
-    return re.sub(r'^import \{[^}]*\} from "\./\w+\.js";\n', "", texts, flags=re.MULTILINE)
 
 
 @cache

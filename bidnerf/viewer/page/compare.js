@@ -8,13 +8,15 @@ async function pixels(url, width, height) {
   const image = new Image();
   image.src = url;
   await image.decode();
-  const canvas = element("canvas", { width, height }), context = canvas.getContext("2d", { willReadFrequently: true });
+  const canvas = element("canvas", { width, height }),
+    context = canvas.getContext("2d", { willReadFrequently: true });
   context.drawImage(image, 0, 0, width, height);
   return context.getImageData(0, 0, width, height);
 }
 
 function gradient({ data, width, height }) {
-  const grey = new Float32Array(width * height), slope = new Float32Array(width * height);
+  const grey = new Float32Array(width * height),
+    slope = new Float32Array(width * height);
   for (let i = 0; i < grey.length; i++) grey[i] = (data[4 * i] + data[4 * i + 1] + data[4 * i + 2]) / 765;
   for (let y = 1; y < height - 1; y++) {
     for (let x = 1; x < width - 1; x++) {
@@ -28,27 +30,43 @@ function gradient({ data, width, height }) {
 
 export class Comparison {
   constructor() {
-    this.wanted = "Wipe"; this.share = 50; this.gain = 3; this.refused = true; this.agreeing = true;
+    this.wanted = "Wipe";
+    this.share = 50;
+    this.gain = 3;
+    this.refused = true;
+    this.agreeing = true;
     this.root = element("div", { class: "compare" });
   }
 
   available() {
     const { observed, rendered, depth, matches } = this.shown;
-    return MODES.filter((mode) => (mode === "Depth" ? depth : mode === "Matches" ? matches && observed : observed && rendered));
+    return MODES.filter((mode) =>
+      mode === "Depth" ? depth : mode === "Matches" ? matches && observed : observed && rendered,
+    );
   }
 
   show(shown) {
     this.shown = shown;
     clearInterval(this.timer);
     const modes = this.available();
-    if (!modes.length) { this.root.replaceChildren(shown.observed ? this.still(shown.observed, "photo") : ""); return; }
+    if (!modes.length) {
+      this.root.replaceChildren(shown.observed ? this.still(shown.observed, "photo") : "");
+      return;
+    }
     this.mode = modes.includes(this.wanted) ? this.wanted : modes[0];
     this.draw();
   }
 
-  choose(mode) { if (this.shown && this.available().includes(mode)) { this.mode = this.wanted = mode; this.draw(); } }
+  choose(mode) {
+    if (this.shown && this.available().includes(mode)) {
+      this.mode = this.wanted = mode;
+      this.draw();
+    }
+  }
 
-  image(picture, label) { return element("img", { src: picture.url, alt: label, draggable: false }); }
+  image(picture, label) {
+    return element("img", { src: picture.url, alt: label, draggable: false });
+  }
 
   still(picture, label) {
     const box = element("div", { class: "pictures" }, this.image(picture, label));
@@ -59,24 +77,39 @@ export class Comparison {
   draw() {
     clearInterval(this.timer);
     const base = this.shown.observed ?? this.shown.depth.picture;
-    const box = element("div", { class: "pictures" }), under = element("div", { class: "under" });
+    const box = element("div", { class: "pictures" }),
+      under = element("div", { class: "under" });
     box.style.aspectRatio = `${base.width} / ${base.height}`;
     this[`draw${this.mode}`](box, under);
-    const modes = element("div", { class: "modes", role: "group", "aria-label": "Comparison" }, ...this.available().map((mode) =>
-      element("button", { "aria-pressed": String(mode === this.mode), onclick: () => this.choose(mode) }, mode)));
+    const modes = element(
+      "div",
+      { class: "modes", role: "group", "aria-label": "Comparison" },
+      ...this.available().map((mode) =>
+        element("button", { "aria-pressed": String(mode === this.mode), onclick: () => this.choose(mode) }, mode),
+      ),
+    );
     const focused = this.root.querySelector(".modes :focus") !== null;
     this.root.replaceChildren(modes, box, under);
     if (focused) modes.querySelector("[aria-pressed=true]").focus();
   }
 
-  tag(side, text) { return element("span", { class: `tag ${side}` }, text); }
+  tag(side, text) {
+    return element("span", { class: `tag ${side}` }, text);
+  }
 
   // Two pictures side by side at the edge; the label of each ends with it.
   drawWipe(box, under) {
-    const label = this.shown.label ?? "rendered", edge = element("div", { class: "edge" });
+    const label = this.shown.label ?? "rendered",
+      edge = element("div", { class: "edge" });
     const left = element("div", {}, this.image(this.shown.observed, "photo"), this.tag("left", "photo"));
     const right = element("div", {}, this.image(this.shown.rendered, label), this.tag("right", label));
-    const range = element("input", { type: "range", id: "wipe", min: "0", max: "100", "aria-label": "Share of the photo" });
+    const range = element("input", {
+      type: "range",
+      id: "wipe",
+      min: "0",
+      max: "100",
+      "aria-label": "Share of the photo",
+    });
     const move = (share) => {
       this.share = share;
       range.value = share;
@@ -87,19 +120,29 @@ export class Comparison {
     range.addEventListener("input", () => move(Number(range.value)));
     const drag = (event) => {
       const bounds = box.getBoundingClientRect();
-      move(Math.max(0, Math.min(100, 100 * (event.clientX - bounds.left) / bounds.width)));
+      move(Math.max(0, Math.min(100, (100 * (event.clientX - bounds.left)) / bounds.width)));
     };
-    box.addEventListener("pointerdown", (event) => { box.setPointerCapture(event.pointerId); drag(event); });
-    box.addEventListener("pointermove", (event) => { if (event.buttons) drag(event); });
+    box.addEventListener("pointerdown", (event) => {
+      box.setPointerCapture(event.pointerId);
+      drag(event);
+    });
+    box.addEventListener("pointermove", (event) => {
+      if (event.buttons) drag(event);
+    });
     box.append(right, left, edge);
     under.append(`only ${label}`, range, "only photo");
     move(this.share);
   }
 
   drawBlink(box, under) {
-    const top = this.image(this.shown.observed, "photo"), label = element("span", { class: "tag left" });
+    const top = this.image(this.shown.observed, "photo"),
+      label = element("span", { class: "tag left" });
     let on = true;
-    const set = (value) => { on = value; top.style.visibility = on ? "visible" : "hidden"; label.textContent = on ? "photo" : this.shown.label ?? "rendered"; };
+    const set = (value) => {
+      on = value;
+      top.style.visibility = on ? "visible" : "hidden";
+      label.textContent = on ? "photo" : (this.shown.label ?? "rendered");
+    };
     const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
     if (!still) this.timer = setInterval(() => set(!on), 700);
     box.addEventListener("click", () => set(!on));
@@ -109,15 +152,28 @@ export class Comparison {
   }
 
   drawDifference(box, under) {
-    const { width, height } = this.shown.rendered, canvas = element("canvas", { width, height });
-    const range = element("input", { type: "range", min: "1", max: "8", step: "0.5", value: String(this.gain), "aria-label": "Amplification" });
+    const { width, height } = this.shown.rendered,
+      canvas = element("canvas", { width, height });
+    const range = element("input", {
+      type: "range",
+      min: "1",
+      max: "8",
+      step: "0.5",
+      value: String(this.gain),
+      "aria-label": "Amplification",
+    });
     const both = Promise.all([this.shown.observed, this.shown.rendered].map(({ url }) => pixels(url, width, height)));
     const paint = async () => {
-      const [a, b] = await both, out = new ImageData(width, height);
-      for (let i = 0; i < a.data.length; i++) out.data[i] = i % 4 === 3 ? 255 : this.gain * Math.abs(a.data[i] - b.data[i]);
+      const [a, b] = await both,
+        out = new ImageData(width, height);
+      for (let i = 0; i < a.data.length; i++)
+        out.data[i] = i % 4 === 3 ? 255 : this.gain * Math.abs(a.data[i] - b.data[i]);
       canvas.getContext("2d").putImageData(out, 0, 0);
     };
-    range.addEventListener("input", () => { this.gain = Number(range.value); paint(); });
+    range.addEventListener("input", () => {
+      this.gain = Number(range.value);
+      paint();
+    });
     box.append(canvas);
     under.append("black where equal", range, "amplified");
     paint();
@@ -125,21 +181,31 @@ export class Comparison {
 
   matchesText({ refused, by_appearance: looks, pose }) {
     const whose = pose ? `Matches of ${pose}. ` : "";
-    const which = refused ? `Of those, ${looks} were matched by appearance alone, ${refused - looks} near where the pose predicts the landmark, but too far off. ` : "";
+    const which = refused
+      ? `Of those, ${looks} were matched by appearance alone, ${refused - looks} near where the pose predicts the landmark, but too far off. `
+      : "";
     return `${whose}${which}Lines lead to where the landmark is.`;
   }
 
   async drawEdges(box, under) {
-    const { width, height } = this.shown.rendered, canvas = element("canvas", { width, height });
+    const { width, height } = this.shown.rendered,
+      canvas = element("canvas", { width, height });
     box.append(canvas);
-    under.append(element("span", {}, element("i", { class: "dot", style: "background:#00be6e" }), "edges of the photo"),
-      element("span", {}, element("i", { class: "dot", style: "background:#eb008c" }), "of the rendering"));
-    const [a, b] = await Promise.all([this.shown.observed, this.shown.rendered].map(({ url }) => pixels(url, width, height)));
-    const ours = gradient(a), theirs = gradient(b), out = new ImageData(width, height);
-    const green = [0, 190, 110], pink = [235, 0, 140];
+    under.append(
+      element("span", {}, element("i", { class: "dot", style: "background:#00be6e" }), "edges of the photo"),
+      element("span", {}, element("i", { class: "dot", style: "background:#eb008c" }), "of the rendering"),
+    );
+    const [a, b] = await Promise.all(
+      [this.shown.observed, this.shown.rendered].map(({ url }) => pixels(url, width, height)),
+    );
+    const ours = gradient(a),
+      theirs = gradient(b),
+      out = new ImageData(width, height);
+    const green = [0, 190, 110],
+      pink = [235, 0, 140];
     for (let i = 0; i < ours.length; i++) {
       for (let c = 0; c < 3; c++) {
-        let value = 0.55 * (a.data[4 * i + c] + b.data[4 * i + c]) / 2 + 0.45 * 255;
+        let value = (0.55 * (a.data[4 * i + c] + b.data[4 * i + c])) / 2 + 0.45 * 255;
         value += 0.9 * theirs[i] * (pink[c] - value);
         value += 0.9 * ours[i] * (green[c] - value);
         out.data[4 * i + c] = value;
@@ -151,7 +217,11 @@ export class Comparison {
 
   drawDepth(box, under) {
     const { depth, observed, unit } = this.shown;
-    if (observed) { const photo = this.image(observed, "photo"); photo.style.filter = "grayscale(1) opacity(.35)"; box.append(photo); }
+    if (observed) {
+      const photo = this.image(observed, "photo");
+      photo.style.filter = "grayscale(1) opacity(.35)";
+      box.append(photo);
+    }
     box.append(this.image(depth.picture, "depth difference"));
     const end = lengthText(depth.range, unit);
     under.append(`map nearer by ${end}`, element("div", { class: "scale" }), `farther by ${end}`);
@@ -159,32 +229,56 @@ export class Comparison {
   }
 
   drawMatches(box, under) {
-    const { observed, matches } = this.shown, photo = this.image(observed, "photo");
+    const { observed, matches } = this.shown,
+      photo = this.image(observed, "photo");
     const svg = document.createElementNS(SVG, "svg");
     svg.setAttribute("viewBox", `0 0 ${observed.width} ${observed.height}`);
     photo.style.filter = "brightness(.75)";
-    const points = numbers(matches.keypoints), seen = numbers(matches.projections), accepted = numbers(matches.accepted);
+    const points = numbers(matches.keypoints),
+      seen = numbers(matches.projections),
+      accepted = numbers(matches.accepted);
     const add = (tag, attributes) => {
       const made = document.createElementNS(SVG, tag);
       for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
       svg.append(made);
     };
-    const w = observed.width, h = observed.height;
+    const w = observed.width,
+      h = observed.height;
     const draw = () => {
       svg.replaceChildren();
       for (let i = 0; i < accepted.length; i++) {
-        const x = points[2 * i] * w, y = points[2 * i + 1] * h, u = seen[2 * i] * w, v = seen[2 * i + 1] * h;
-        if (accepted[i] && this.agreeing) add("circle", { cx: x, cy: y, r: 2.6, fill: "none", stroke: "#4be08f", "stroke-width": 1.1 });
+        const x = points[2 * i] * w,
+          y = points[2 * i + 1] * h,
+          u = seen[2 * i] * w,
+          v = seen[2 * i + 1] * h;
+        if (accepted[i] && this.agreeing)
+          add("circle", { cx: x, cy: y, r: 2.6, fill: "none", stroke: "#4be08f", "stroke-width": 1.1 });
         if (accepted[i] || !this.refused) continue;
-        if (Number.isFinite(u)) add("line", { x1: x, y1: y, x2: u, y2: v, stroke: "#ff7a52", "stroke-width": 0.5, opacity: 0.6 });
+        if (Number.isFinite(u))
+          add("line", { x1: x, y1: y, x2: u, y2: v, stroke: "#ff7a52", "stroke-width": 0.5, opacity: 0.6 });
         add("path", { d: `M${x - 2},${y - 2}l4,4m-4,0l4,-4`, stroke: "#ff7a52", "stroke-width": 1.2 });
       }
     };
-    const box2 = (key, colour, text) => element("label", {},
-      element("input", { type: "checkbox", checked: this[key], onchange: (event) => { this[key] = event.target.checked; draw(); } }),
-      element("i", { class: "dot", style: `background:${colour};margin:0` }), text);
-    under.append(box2("agreeing", "#2fb872", `${matches.agreeing} agree`), box2("refused", "#ff7a52", `${matches.refused} do not`),
-      element("span", {}, this.matchesText(matches)));
+    const box2 = (key, colour, text) =>
+      element(
+        "label",
+        {},
+        element("input", {
+          type: "checkbox",
+          checked: this[key],
+          onchange: (event) => {
+            this[key] = event.target.checked;
+            draw();
+          },
+        }),
+        element("i", { class: "dot", style: `background:${colour};margin:0` }),
+        text,
+      );
+    under.append(
+      box2("agreeing", "#2fb872", `${matches.agreeing} agree`),
+      box2("refused", "#ff7a52", `${matches.refused} do not`),
+      element("span", {}, this.matchesText(matches)),
+    );
     box.append(photo, svg);
     draw();
   }

@@ -3,7 +3,8 @@
 const KINDS = { int8: Int8Array, uint8: Uint8Array, uint16: Uint16Array, float32: Float32Array };
 
 export function numbers(packed) {
-  const text = atob(packed.base64), bytes = new Uint8Array(text.length);
+  const text = atob(packed.base64),
+    bytes = new Uint8Array(text.length);
   for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
   return new KINDS[packed.type](bytes.buffer);
 }
@@ -21,7 +22,7 @@ export function element(tag, attributes = {}, ...children) {
 
 // Text in which what stands between backticks is code.
 export function withCode(text) {
-  return text.split("`").map((part, i) => i % 2 ? element("code", {}, part) : part);
+  return text.split("`").map((part, i) => (i % 2 ? element("code", {}, part) : part));
 }
 
 export const find = (id) => document.getElementById(id);
@@ -44,10 +45,18 @@ export function colourOf(name) {
 }
 
 // Colours from dark blue over green to yellow, for t from 0 to 1.
-const SCALE = [[0.24, 0.29, 0.54], [0.17, 0.49, 0.56], [0.13, 0.66, 0.52], [0.56, 0.84, 0.27], [0.99, 0.91, 0.14]];
+const SCALE = [
+  [0.24, 0.29, 0.54],
+  [0.17, 0.49, 0.56],
+  [0.13, 0.66, 0.52],
+  [0.56, 0.84, 0.27],
+  [0.99, 0.91, 0.14],
+];
 
 export function scaleColour(t) {
-  const x = Math.max(0, Math.min(0.9999, t)) * (SCALE.length - 1), i = Math.floor(x), f = x - i;
+  const x = Math.max(0, Math.min(0.9999, t)) * (SCALE.length - 1),
+    i = Math.floor(x),
+    f = x - i;
   return SCALE[i].map((value, k) => value + f * (SCALE[i + 1][k] - value));
 }
 
