@@ -25,7 +25,7 @@ unexport PYTHONDONTWRITEBYTECODE
 INSTALL = $(BIN)/python -m pip install --disable-pip-version-check --no-compile -c constraints.txt
 SHOW_LONG = { grep --line-buffered -E 'Downloading .*(MB|GB)|^Installing collected' | cut -c1-100 || true; }
 
-.PHONY: help demo test slow robustness shapes check lint format page types arrows wheels docs clean
+.PHONY: help demo test slow robustness shapes check lint format page types arrows records wheels docs clean
 
 help: ## this list
 	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/^([a-z]+):[^#]*## /  make \1\t/' | expand -t 18
@@ -47,7 +47,7 @@ shapes: $(VENV)/.installed-dev ## a backend's contract and a map, with checks of
 robustness: $(VENV)/.installed-dev ## hostile inputs, kills, full disks and crowds, counted; takes half an hour; ARGS="--only fuzz"
 	@OMP_NUM_THREADS=1 $(BIN)/python tests/robustness/counts.py $(ARGS)
 
-check: lint types arrows ## everything that is checked without running the code
+check: lint types arrows records ## everything that is checked without running the code
 
 lint: $(VENV)/.installed-dev ## style, of Python and of JavaScript
 	@$(BIN)/ruff format --check --quiet --output-format concise || { echo "not formatted: run 'make format'"; exit 1; }
@@ -60,6 +60,9 @@ types: $(VENV)/.installed-dev ## static types
 
 arrows: $(VENV)/.installed-dev ## which module may import which
 	@$(BIN)/lint-imports --no-logo
+
+records: $(BIN)/pip ## whether the records that the documentation cites are older than what they measure
+	@$(BIN)/python benchmarks/stale.py >/dev/null && echo "records: none is newly out of date"
 
 wheels: $(VENV)/.installed-dev ## what is distributed, of bidnerf and of every plugin, in dist/
 	@rm -rf dist
