@@ -41,5 +41,5 @@ def run_completion(
     else:
         cases = "\n".join(f'    {name}) words="{" ".join(flags)}" ;;' for name, flags in options.items())
         lines = BASH.format(commands=" ".join(options), cases=cases).splitlines()
-    start = ["autoload -U +X bashcompinit && bashcompinit"] if shell == "zsh" else []
-    print_result(None, [*start, *lines], json=False)
+    starts = {"zsh": ["autoload -U +X bashcompinit && bashcompinit"]}
+    print_result(None, starts.get(shell, []) + lines, json=False)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TrialOptions:
-    """Which frames are tried, and from which starts."""
+    """Which frames are tried, with what changes, and from which starts."""
 
     protocol: Annotated[
         Literal["bid", "bid-hard", "inerf", "perturb", "none"] | None,
@@ -62,6 +62,16 @@ class TrialOptions:
         int | None, EXPERT, WholeNumbers(0, LARGEST_SEED), Option("N", "seed of every random choice", "the protocol's")
     ] = None
     frame: FrameNames = ()
+    no_depth: NoDepth = False
+    fault: Annotated[
+        Names,
+        Option(
+            "NAME:SIZE...",
+            "repeat every trial with each of these image faults, one of 'bidnerf plugins faults'; NAME:SIZE,SIZE gives"
+            " several sizes, A:SIZE+B:SIZE combines two, none leaves the images unchanged",
+            "none",
+        ),
+    ] = ()
 
     def plan(self, method: MethodOptions, images: DatasetOptions, **more: Any) -> Plan:
         """Return the plan of the trials; ``more`` holds the fields of the plan that these options do not set."""
@@ -87,23 +97,9 @@ class TrialOptions:
             )
 
 
-Starts: TypeAlias = Annotated[TrialOptions, Group("starts", "Which frames are tried, and from which starts.")]
-
-
-@dataclass(frozen=True)
-class InputOptions:
-    """What the method receives."""
-
-    no_depth: NoDepth = False
-    fault: Annotated[
-        Names,
-        Option(
-            "NAME:SIZE...",
-            "repeat every trial with each of these image faults, one of 'bidnerf plugins faults'; NAME:SIZE,SIZE gives"
-            " several sizes, A:SIZE+B:SIZE combines two, none leaves the images unchanged",
-            "none",
-        ),
-    ] = ()
+Starts: TypeAlias = Annotated[
+    TrialOptions, Group("trials", "Which frames are tried, with what changes, and from which starts.")
+]
 
 
 @dataclass(frozen=True)
@@ -129,7 +125,6 @@ def run_evaluate(
     ] = None,
     *,
     starts: Starts,
-    input: Annotated[InputOptions, Group("input", "What the method receives of each frame.")],
     work: Annotated[WorkOptions, Group("work", "Where the trials are run."), Without("overwrite")],
     images: SeenImages = TEST_IMAGES,
     method: MethodGroup,
@@ -151,15 +146,15 @@ def run_evaluate(
         method,
         images,
         device=work.device,
-        depth=not input.no_depth,
-        faults=input.fault,
+        depth=not starts.no_depth,
+        faults=starts.fault,
     )
     require_device(work.device)
     require_outside_maps(out.parent, out)
     with interruptible_work("waiting for the trials under way (Ctrl-C again: at once)"):
         table = evaluate(map, data or map, plan, out=out, workers=work.dask or work.workers)
-    text = f"{amount(len(table.rows), 'trial')} in {out}; 'bidnerf report {out}' shows them"
-    print_result([row.plain() for row in table.rows], [text], work.json)
+    lines = [f"{amount(len(table.rows), 'trial')} in {out}; 'bidnerf report {out}' shows them"]
+    print_result([row.plain() for row in table.rows], lines, work.json)
 
 
 def run_compare(
@@ -181,7 +176,7 @@ def run_compare(
         ),
     ] = None,
     *,
-    starts: Annotated[Starts, Without("size")],
+    starts: Annotated[Starts, Without("size", "no_depth", "fault")],
     run: RunOptions,
     images: SeenImages = TEST_IMAGES,
     method: MethodGroup,
@@ -248,8 +243,8 @@ def run_report(
 
     table = ResultTable.load(*results)
     with wrong_usage():
-        name = next((name for name in CRITERIA if criterion and name.startswith(criterion)), None)
-        chosen = choose_criterion(name, table.groups)
+        names = [name for name in CRITERIA if criterion and name.startswith(criterion)]
+        chosen = choose_criterion(names[0] if names else None, table.groups)
     if view is not None and not view.is_file():
         raise InputError("no such page", where=view, expected="one written by 'bidnerf view MAP --results ... --save'")
     if missing := [folder for folder in data if not Path(folder).is_dir()]:

@@ -242,8 +242,7 @@ class Run:
         finally:  # however the run ended: also by Ctrl-C, SIGTERM, a closed pipe or a full disk
             with defer_interruptions():
                 if is_whole and total > 1:
-                    scene = answers.scene
-                    more = f" in {len(scene)} maps" if isinstance(scene, MapCollection) else ""
+                    more = f" in {len(answers.scene)} maps" if isinstance(answers.scene, MapCollection) else ""
                     say(f"{len(answers.accepted)} of {total} accepted{more}")
                 if is_whole and answers.world_mismatch is not None:
                     say(answers.world_mismatch)
@@ -264,9 +263,8 @@ def answer_lines(answer: Answer, full: bool) -> list[str]:
     from bidnerf_core.geometry import symbol
 
     localization, error, placement = answer.localization, answer.error, answer.placement
-    verdict = "accepted" if localization.converged else f"refused: {localization.outcome.value}"
-    verdict = f"{verdict} ({localization.reason})"
-    world, runner_up = "", []
+    outcome = "accepted" if localization.converged else f"refused: {localization.outcome.value}"
+    verdict, world, runner_up = f"{outcome} ({localization.reason})", "", []
     if placement is not None:
         where = "in" if localization.converged else "in none of the maps; nearest"
         verdict, world = f"{where} {placement.map}: {verdict}", f"in the frame of {placement.map}, "
@@ -275,8 +273,8 @@ def answer_lines(answer: Answer, full: bool) -> list[str]:
         outcome = "accepted too" if other.converged else other.outcome
         runner_up = [f"  runner-up {name}: {outcome} ({other.reason})"]
     if error is not None:
-        offset = f"{float(error.translation):.4f} {symbol(error.unit)}, {float(error.rotation_deg):.3f} deg"
-        verdict = f"error {offset}; {verdict}"
+        distance, angle = float(error.translation), float(error.rotation_deg)
+        verdict = f"error {distance:.4f} {symbol(error.unit)}, {angle:.3f} deg; {verdict}"
     lines = [
         f"{answer.name}: {verdict}; {amount(localization.steps, 'step')}, {localization.seconds:.2f} s",
         *runner_up,
@@ -288,7 +286,7 @@ def answer_lines(answer: Answer, full: bool) -> list[str]:
         )
     if full:
         lengths = "metres" if localization.unit == "metres" else "units of the map"
-        rows = localization.T_world_camera.matrix().tolist()
         lines.append(f"  T_world_camera ({world}{OPENCV_AXES}; lengths in {lengths})")
-        lines += ["    " + " ".join(f"{value: .6f}" for value in row) for row in rows]
+        matrix = localization.T_world_camera.matrix().tolist()
+        lines += ["    " + " ".join(f"{value: .6f}" for value in row) for row in matrix]
     return lines

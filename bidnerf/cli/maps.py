@@ -67,9 +67,7 @@ def run_info(
             raise InputError(
                 "has no record of its photos to draw; 'bidnerf bake MAP --data DATA' creates one", where=map
             )
-        seen_by = None if scene.landmarks is None else scene.landmarks.views
-        points = None if scene.landmarks is None else scene.landmarks.positions
-        draw_capture(scene.capture, points, seen_by, plot, scene.unit)
+        draw_capture(scene.capture, scene.landmarks, plot, scene.unit)
         say(f"{plot}: written")
     summary = scene.describe()
     print_result(summary.plain(), str(summary).splitlines(), json)
@@ -213,8 +211,8 @@ def _render_views(scene: Map, level: int | None, views: Sequence[View], out: Pat
     errors = torch.cat([score.depth_errors for score in scores])
     mean = RenderingScores(statistics.fmean(score.psnr for score in scores), errors, scene.unit)
     error = "-" if mean.depth_error is None else f"{mean.depth_error:.4f}"
-    text = f"PSNR {mean.psnr:.2f} dB; median depth error over all pixels {error} {symbol(scene.unit)}"
-    print_result({"psnr": mean.psnr, "depth_error": mean.depth_error}, [f"mean of {len(scores)}: {text}"], json)
+    text = f"mean of {len(scores)}: PSNR {mean.psnr:.2f} dB; median depth error over all pixels {error} {symbol(scene.unit)}"
+    print_result({"psnr": mean.psnr, "depth_error": mean.depth_error}, [text], json)
 
 
 def write_images(out: Path, name: str, image: RenderedImage) -> None:
@@ -229,8 +227,7 @@ def write_images(out: Path, name: str, image: RenderedImage) -> None:
     deepest = np.iinfo(np.uint16).max
     if millimetres.max() > deepest:
         say(f"{name}: depth beyond {deepest / 1000} units does not fit a 16-bit image in steps of 0.001 and is clipped")
-    depth = millimetres.clip(0, deepest).astype(np.uint16)
-    write_file(out / f"{name}.depth.png", png_bytes(depth))
+    write_file(out / f"{name}.depth.png", png_bytes(millimetres.clip(0, deepest).astype(np.uint16)))
 
 
 def run_bake(

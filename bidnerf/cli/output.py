@@ -78,8 +78,8 @@ def check_output(out: Path, inputs: Iterable[Path | str | None], overwrite: bool
     """
     # os.path functions return False for a name that is too long, which is reported when it is written.
     if os.path.isdir(out) or not os.path.isdir(out.parent):
-        what = "is a folder" if os.path.isdir(out) else f"no folder {out.parent}"
-        raise InputError(what, where=out, expected="a file in an existing folder")
+        found = "is a folder" if os.path.isdir(out) else f"no folder {out.parent}"
+        raise InputError(found, where=out, expected="a file in an existing folder")
     require_outside_maps(out.parent, out)
     _require_writable(out.parent, out)
     if not os.path.exists(out):
@@ -130,5 +130,5 @@ def _require_writable(folder: Path, out: Path) -> None:
     try:
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        reason = f"cannot be written: {error.strerror}"
-        raise InputError(reason, where=out, expected="a folder in which files can be created") from error
+        expected = "a folder in which files can be created"
+        raise InputError(f"cannot be written: {error.strerror}", where=out, expected=expected) from error

@@ -154,19 +154,16 @@ def parse(command: str, target: Callable[..., T], arguments: Sequence[str]) -> T
     # The names of options may be written with underscores, as in Python.
     words = [re.sub("^--[^=]*", lambda name: name[0].replace("_", "-"), word) for word in arguments[:end]]
     pages, words = {"-h", HELP, HELP_ALL} & set(words), [*words, *arguments[end:]]
-    if pages and HELP_ALL not in pages:
-        sys.stdout.write(_Parser(command, target, {}, short=True).format_help())
-        raise SystemExit(0)
-    loaded = dict[str, Any]()  # the default settings that depend on other arguments, by parameter name
+    short, loaded = bool(pages) and HELP_ALL not in pages, dict[str, Any]()  # the default settings, by parameter name
     pending = {p.name: note for p, note in leaves(target, {}) if isinstance(note, SettingsGroup)}
-    if pending:
+    if pending and not short:
         first = _Parser(command, target, {}, options_only=True)
         given = vars(first.parse_known_args(_escape(words))[0])
         if not pages and not first.may_hold_a_setting(words):
             _Parser(command, target, {}).parse_all(words)  # refuses what is missing before settings are loaded
         values = {p.name: p.default for p, _ in leaves(target, {})} | given
         loaded = {name: note.load(values, words) for name, note in pending.items()}
-    parser = _Parser(command, target, loaded)
+    parser = _Parser(command, target, loaded, short)
     if pages:
         sys.stdout.write(parser.format_help())
         raise SystemExit(0)

@@ -136,5 +136,4 @@ def run_track(
         if not path.accepted:
             say(f"no pose of {amount(len(path), 'frame')} was accepted")
     if path.unread:
-        read = amount(path.unread + len(path), "frame")
-        raise InputError(f"{path.unread} of {read} could not be read, see above")
+        raise InputError(f"{path.unread} of {path.unread + len(path)} frames could not be read, see above")

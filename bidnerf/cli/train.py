@@ -68,15 +68,10 @@ def run_poses(
     from bidnerf_core.datasets import POSERS
     from bidnerf_core.io import to_plain
 
-    given = _given_camera(camera, photos_camera)
+    given = camera if photos_camera == CameraOptions() else photos_camera.source(camera)
     with interruptible_work("stopping (Ctrl-C again: at once); what was found is kept"):
         poses = POSERS.load(poser)(photos, out, given, overwrite)
     print_result(to_plain(poses), (), json)
-
-
-def _given_camera(camera: Any, options: CameraOptions) -> Any:
-    """Return the camera given for photos: ``camera``, or a source of the focal length or the field of view."""
-    return camera if options == CameraOptions() else options.source(camera)
 
 
 def _backend_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:
@@ -177,9 +172,8 @@ def run_train(
 
     resumes, bake = training.resume or training.finish, not target.no_bake
     if resumes and (target.overwrite or training.quick):
-        continuing = "--resume" if training.resume else "--finish"
-        other = "--overwrite" if target.overwrite else "--quick"
-        raise UsageError(f"{continuing} continues a map, {other} starts a new one; expected only one of them")
+        names = "--resume" if training.resume else "--finish", "--overwrite" if target.overwrite else "--quick"
+        raise UsageError("{} continues a map, {} starts a new one; expected only one of them".format(*names))
     if training.finish and not bake:
         raise UsageError("--finish bakes the map, --no-bake does not; expected only one of them")
     if images.background is not None:
@@ -187,7 +181,8 @@ def run_train(
             background_colour(images.background)
     check_folder(out, (data,), may_be_map=True)
     require_device(target.device)
-    images = replace(images, camera=_given_camera(images.camera, given_poses.camera))
+    if given_poses.camera != CameraOptions():
+        images = replace(images, camera=given_poses.camera.source(images.camera))
     photos = lacks_poses(data, images)
     if photos:
         given = {"--depth-unit": images.depth_unit, "--register-depth": images.register_depth, "--masks": images.masks}

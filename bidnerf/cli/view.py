@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from bidnerf import service, viewer
 from bidnerf.cli.options import (
@@ -29,12 +29,10 @@ from bidnerf.service import serve as serve_maps
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.installation import import_extra
 from bidnerf_core.io import read_file
-from bidnerf_core.progress import counter
 from bidnerf_core.registry import USUAL_METHOD
 
 if TYPE_CHECKING:
-    from bidnerf_core.datasets import QuerySource
-    from bidnerf_core.localization import Localizer
+    pass
 
 
 @dataclass(frozen=True)
@@ -94,7 +92,7 @@ def run_view(
     say(f"loading {map}")
 
     from bidnerf.evaluation import read_results
-    from bidnerf.viewer import MapView, map_json, row_json, trajectory_json
+    from bidnerf.viewer import MapView, answer_all, map_json, row_json, trajectory_json
     from bidnerf_core.camera import CameraSource
     from bidnerf_core.datasets import DatasetFrames
     from bidnerf_core.localization import Localizer
@@ -106,13 +104,12 @@ def run_view(
     rows = () if page.results is None else tuple(row_json(row) for row in read_results([page.results]))
     scene = load_map(map, server.device)
     localizer = Localizer(scene, server.method, warm_up=page.save is None)
-    source = None
-    camera = queries.camera.source(images.camera, localizer.assumed_cameras)
-    if opener is not None:
-        source = opener(localizer.assumed_cameras, scene.bounds.background)
-        camera = CameraSource() if isinstance(source, DatasetFrames) else camera
-        if page.save is not None and not queries.frame:  # at most 24 images, spread over all
-            source = source.select(range(0, len(source.names), -(-len(source.names) // 24)))
+    assumed = localizer.assumed_cameras
+    source = None if opener is None else opener(assumed, scene.bounds.background)
+    if source is not None and page.save is not None and not queries.frame:  # at most 24 images, spread over all
+        source = source.select(range(0, len(source.names), -(-len(source.names) // 24)))
+    own = isinstance(source, DatasetFrames)
+    camera = CameraSource() if own else queries.camera.source(images.camera, assumed)
     if page.save is None:
         viewer.serve_view(
             viewer.LiveView(localizer, source, path, rows, camera),
@@ -121,29 +118,11 @@ def run_view(
             ready=lambda address: say(f"look at {address}; Ctrl-C ends"),
         )
         return
-    answers = () if source is None else _localize_all(localizer, source)
+    with display_progress():
+        answers = () if source is None else answer_all(localizer, source)
     with console.status("drawing the map"):
         MapView(map_json(scene), answers, trajectory=path, results=rows).save(page.save)
     show(f"look at {page.save}")
-
-
-def _localize_all(localizer: Localizer, source: QuerySource) -> tuple[dict[str, Any], ...]:
-    """Localize all queries, and return the page's JSON values of each. Raises ``InputError`` if none can be read."""
-    from bidnerf.results import BAD_INPUT
-    from bidnerf.viewer import answer_image
-
-    answers, total = [], len(source.names)
-    with display_progress():
-        count = counter("localizing and rendering", "images")
-        for index in range(total):
-            answers.append(answer_image(localizer, source, index))
-            count(index + 1, total)
-    unread = [answer for answer in answers if answer["outcome"] == BAD_INPUT]
-    if unread and len(unread) == len(answers):
-        raise InputError(unread[0]["reason"])
-    for answer in unread:
-        say(f"{answer['name']}: {answer['reason']}")
-    return tuple(answers)
 
 
 TOKEN = "BIDNERF_TOKEN"

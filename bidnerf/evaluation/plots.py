@@ -182,16 +182,14 @@ class Figures:
             panels += [(own[0].title, partial(each, groups=own)) for each in draw]
         shown = {group.label for group in groups}
         looks = {label: look for label, look in self.looks.items() if label in shown}
-        return self._figure(name, panels, looks, caption)
+        return self._figure(name, panels, looks, caption) if panels else None
 
     def _figure(
         self, name: str, panels: Sequence[Panel], looks: Mapping[str, Mapping[str, Any]], caption: str
-    ) -> Figure | None:
-        """Draw panels in rows of ``COLUMNS`` with a legend below; None if there are none."""
+    ) -> Figure:
+        """Draw one or more panels in rows of ``COLUMNS`` with a legend below."""
         from matplotlib.lines import Line2D
 
-        if not panels:
-            return None
         columns = min(COLUMNS, len(panels))
         rows = math.ceil(len(panels) / columns)
         titles = [_wrap(title, WIDTH / columns - 0.4) for title, _ in panels]
@@ -262,6 +260,4 @@ def comparison_figure(folder: Path, comparison: Comparison) -> Path:
         (title, partial(draw, groups=groups)) for title, draw in zip(titles, figures.cumulative(), strict=True)
     ]
     panels += [(name, partial(bars, values=values)) for name, values in costs.items() if any(values)]
-    drawn = figures._figure("compare", panels, figures.looks, "")
-    assert drawn is not None  # there are panels
-    return drawn[0]
+    return figures._figure("compare", panels, figures.looks, "")[0]

@@ -164,8 +164,7 @@ def registered_for(trial: Trial) -> list[tuple[str, str]]:
     The map may need any detector and backend, and the dataset any reader.
     """
     named = {("methods", trial.method), *(("faults", fault.name) for fault in parse_faults(trial.fault))}
-    needed = ("backends", "features", "readers")
-    return [key for key in list(registered) if key in named or key[0] in needed]
+    return [key for key in list(registered) if key in named or key[0] in ("backends", "features", "readers")]
 
 
 def trial_views(trial: Trial, dataset: Capture) -> list[View]:
@@ -240,11 +239,10 @@ def views_digest(views: Sequence[View]) -> str:
     """Return the digest of the images, depth, alpha, hidden pixels, intrinsics and poses of ``views``; it depends on their order."""
     hashed = hashlib.blake2b(digest_size=16)
     for view in views:
-        frame = view.frame
+        frame, images = view.frame, [view.frame.rgb, view.frame.depth, view.frame.alpha, view.T_ref_camera.matrix()]
         camera = json.dumps(to_plain(frame.intrinsics), sort_keys=True)
         hashed.update(f"{frame.name}\n{camera}\n".encode(errors="surrogatepass"))
-        hidden = () if frame.hidden is None else (frame.hidden,)
-        for image in (frame.rgb, frame.depth, frame.alpha, view.T_ref_camera.matrix(), *hidden):
+        for image in images if frame.hidden is None else [*images, frame.hidden]:
             if image is None:
                 hashed.update(b"none\n")
                 continue

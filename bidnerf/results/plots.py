@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.captures import (
@@ -25,7 +25,7 @@ from bidnerf_core.errors import InputError, printable
 from bidnerf_core.geometry import SE3, LengthUnit
 from bidnerf_core.installation import import_extra
 from bidnerf_core.io import write_file
-from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.mapping import LandmarkMap, SurfaceMap
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
 """The colour-blind-safe palette of Okabe and Ito (2008), with brown instead of yellow, which is hard to see on white."""
@@ -120,15 +120,13 @@ def line_style(number: int) -> dict[str, Any]:
 
 def draw_capture(
     report: CaptureReport,
-    points: Float[Tensor, "n 3"] | None,
-    seen_by: Int[Tensor, "n"] | None,
+    landmarks: LandmarkMap | None,
     out: Path,
     unit: LengthUnit = "units",
 ) -> None:
     """Draw a top view of a capture to ``out``, a PNG: its cameras with their directions and problems, and its landmarks.
 
-    ``points`` (world, in ``unit``) are the landmarks, and ``seen_by`` is the number of photos that show each
-    landmark. Raises ``InputError`` if matplotlib is not installed, or the file cannot be written.
+    Lengths are in ``unit``. Raises ``InputError`` if matplotlib is not installed, or the file cannot be written.
     """
     up, centre = (torch.tensor(v, dtype=torch.float64) for v in (report.coverage.up, report.coverage.centre))
     axes = torch.stack(horizontal_axes(up), dim=-1)
@@ -144,10 +142,10 @@ def draw_capture(
         reach = 1.5 * max(float(np.abs(cameras).max()), 1e-6)
         panel.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", title="The capture from above")
         panel.set_xlabel(f"{unit}, from the centre of the capture")
-        if points is not None and seen_by is not None and len(points):
-            step = math.ceil(len(points) / 20_000)
-            places, views = ((points[::step].double() - centre) @ axes).numpy(), seen_by[::step].numpy()
-            drawn = panel.scatter(*places.T, c=views, s=2, cmap="Blues", vmin=0, linewidths=0, zorder=1)
+        if landmarks is not None and len(landmarks):
+            step = math.ceil(len(landmarks) / 20_000)
+            places, views = (landmarks.positions[::step].double() - centre) @ axes, landmarks.views[::step].numpy()
+            drawn = panel.scatter(*places.numpy().T, c=views, s=2, cmap="Blues", vmin=0, linewidths=0, zorder=1)
             figure.colorbar(drawn, ax=panel, label="photos that show a landmark", shrink=0.7, pad=0.02)
         panel.quiver(*cameras.T, *directions.T, color="#555", scale=25, width=0.002, headwidth=1, zorder=2)
         worst = [photo.problems[0] if photo.problems else "without a finding" for photo in report.photos]

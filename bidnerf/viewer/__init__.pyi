@@ -1,6 +1,6 @@
 from .app import LiveView as LiveView
 from .pages import MapView as MapView
-from .pages import answer_image as answer_image
+from .pages import answer_all as answer_all
 from .pages import row_json as row_json
 from .pages import view as view
 from .scene import map_json as map_json

@@ -195,8 +195,7 @@ def depth_difference(image: RenderedImage, frame: Frame) -> JsonObject | None:
     """
     if frame.depth is None or not frame.has_depth:
         return None
-    height, width = image.depth.shape
-    measured = resample_nearest(frame.depth.cpu(), width, height)
+    measured = resample_nearest(frame.depth.cpu(), image.depth.shape[1], image.depth.shape[0])
     known = (measured > 0) & (image.depth > 0)
     if not bool(known.any()):
         return None
@@ -210,8 +209,11 @@ def depth_difference(image: RenderedImage, frame: Frame) -> JsonObject | None:
     towards = torch.where((share > 0)[..., None], far, near)
     rgb = middle + share.abs()[..., None] * (towards - middle)
     pixels = torch.cat([rgb, known[..., None].float()], dim=-1)
-    picture = png_json((pixels * 255 + 0.5).to(torch.uint8).numpy())
-    return {"picture": picture, "range": most, "median": float(difference.abs().median())}
+    return {
+        "picture": png_json((pixels * 255 + 0.5).to(torch.uint8).numpy()),
+        "range": most,
+        "median": float(difference.abs().median()),
+    }
 
 
 def _steps(localization: Localization, record: SearchRecord | None) -> tuple[JsonObject, ...]:

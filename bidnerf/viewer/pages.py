@@ -6,6 +6,7 @@ import base64
 import hashlib
 import html
 import json
+import logging
 import math
 import re
 from collections.abc import Callable
@@ -26,6 +27,9 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.io import to_plain, write_file
 from bidnerf_core.localization import Localization, Localizer, SearchRecord, record_search
 from bidnerf_core.maps import Map
+from bidnerf_core.progress import counter
+
+log = logging.getLogger("bidnerf")
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,12 +155,19 @@ def answer_query(
     return add_renderings(answer, scene, localization, frame)
 
 
-def answer_image(localizer: Localizer, source: QuerySource, index: int) -> JsonObject:
-    """Localize the query at an index of a source; if the query cannot be used, the answer states why."""
-    try:
-        return answer_query(localizer, source.read(index))
-    except InputError as error:
-        return no_answer(source.names[index], BAD_INPUT, str(error))
+def answer_all(localizer: Localizer, source: QuerySource) -> tuple[JsonObject, ...]:
+    """Localize all queries of a source; if a query cannot be used, its answer states why. Raises ``InputError`` if none can be."""
+    answers, count, total = list[JsonObject](), counter("localizing and rendering", "images"), len(source.names)
+    for number, name in enumerate(source.names):
+        try:
+            answers.append(answer_query(localizer, source.read(number)))
+        except InputError as error:
+            log.info("%s: %s", name, error)
+            answers.append(no_answer(name, BAD_INPUT, str(error)))
+        count(number + 1, total)
+    if answers and all(answer["outcome"] == BAD_INPUT for answer in answers):
+        raise InputError(answers[0]["reason"])
+    return tuple(answers)
 
 
 def row_json(row: Any) -> JsonObject:

@@ -45,8 +45,7 @@ def map_json(scene: Map, thumbnails: int = 60) -> JsonObject:
     ``unit`` is the symbol of the unit of length, ``up_source`` states how the upward direction ``up`` was found, and
     ``centre`` and ``extent`` (in the unit of the map) are those of the region that the initial view should show.
     """
-    up = scene.up
-    centre, extent = _framing(scene)
+    up, (centre, extent) = scene.up, _framing(scene)
     every = max(1, math.ceil(len(scene.info.cameras) / max(thumbnails, 1)))
     return {
         "name": scene.folder.resolve().name if scene.folder is not None else "map in memory",
@@ -94,8 +93,7 @@ def matrix_rows(T: SE3) -> tuple[float, ...]:
 
 
 def _facts(scene: Map) -> tuple[tuple[str, str], ...]:
-    up = scene.up
-    surfels = 0 if scene.surface is None else len(scene.surface.surfels)
+    up, surfels = scene.up, 0 if scene.surface is None else len(scene.surface.surfels)
     offset = (("origin", "positions shown here are relative to ({:,.0f}, {:,.0f}, {:,.0f})".format(*scene.origin)),)
     landmarks = 0 if scene.landmarks is None else len(scene.landmarks)
     return (
@@ -188,22 +186,20 @@ def _subset(count: int, most: int) -> Tensor:
     return torch.randperm(count, generator=torch.Generator().manual_seed(0))[:most]
 
 
-def _framing(scene: Map) -> tuple[tuple[float, float, float], float]:
+def _framing(scene: Map) -> tuple[Sequence[float], float]:
     """Return the centre of a scene, and the size that encloses most of it, in the unit of the map."""
     if scene.surface is not None and len(scene.surface.surfels):
         points = scene.surface.surfels.positions
     elif scene.landmarks is not None and len(scene.landmarks):
         points = scene.landmarks.positions
     else:
-        x, y, z = scene.bounds.centre
-        return (x, y, z), max(scene.bounds.size)
+        return scene.bounds.centre, max(scene.bounds.size)
     points = points[_subset(len(points), 20_000)].cpu().double()
     if scene.info.cameras:  # weighted so that all cameras together count as a hundredth of the points
         places = poses_of(scene.info.cameras).translation
         points = torch.cat([points, places.repeat(1 + len(points) // (100 * len(places)), 1)])
     low, high = (points.quantile(q, dim=0) for q in (0.01, 0.99))  # a few points may be far away
-    x, y, z = ((low + high) / 2).tolist()
-    return (x, y, z), max(float((high - low).max()), 1e-9)
+    return ((low + high) / 2).tolist(), max(float((high - low).max()), 1e-9)
 
 
 # Trajectories.

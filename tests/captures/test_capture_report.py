@@ -15,7 +15,7 @@ import torch
 from bidnerf import SE3, Frame, Intrinsics, View
 from bidnerf.results import draw_capture
 from bidnerf.scenes import demo_object, orbit, views
-from bidnerf.testing import BOUNDS, TexturedGround
+from bidnerf.testing import BOUNDS, TexturedGround, textured_map
 from bidnerf_core.captures import (
     CaptureReport,
     CoverageRecord,
@@ -271,12 +271,12 @@ def test_a_summary_has_five_lines_and_the_gravest_first() -> None:
 @pytest.mark.slow
 def test_a_picture_is_drawn_of_cameras_gaps_and_landmarks(tmp_path: Path) -> None:
     report = damaged()
-    draw_capture(report, torch.rand(50, 3) - 0.5, torch.arange(50), tmp_path / "a" / "capture.png")
+    draw_capture(report, textured_map().landmarks, tmp_path / "a" / "capture.png")
     image = cv2.imread(str(tmp_path / "a" / "capture.png"))
     assert image.shape[0] > 500
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 50
     with refused(where=tmp_path, found="cannot be written (Is a directory)"):
-        draw_capture(report, None, None, tmp_path)
+        draw_capture(report, None, tmp_path)
 
 
 @pytest.mark.slow
