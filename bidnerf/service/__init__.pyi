@@ -1,6 +1,7 @@
 from .client import ServiceClient as ServiceClient
 from .client import ServiceError as ServiceError
 from .models import LONGEST_NAME as LONGEST_NAME
+from .models import LocalizationBody as LocalizationBody
 from .models import Refused as Refused
 from .models import Upload as Upload
 from .models import validate as validate

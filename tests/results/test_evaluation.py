@@ -22,6 +22,7 @@ from bidnerf.results import (
     steps_to_success,
     success_rate,
     success_rate_by_frame,
+    within,
 )
 
 # Inside: the angles of rotations near zero and pi, and criteria with other bars
@@ -57,6 +58,9 @@ def test_normalized_errors_of_an_honest_covariance_are_chi_squared() -> None:
     found = true @ SE3.exp(drawn).inverse()
     values = normalized_error_squared(found, true, covariance)
     assert kstest(values.numpy(), chi2(6).cdf).pvalue > 0.01
+    for probability in (0.5, 0.95):
+        share = float(within(found, true, covariance, probability).double().mean())
+        assert share == pytest.approx(probability, abs=0.03)
     expected = np.einsum("bi,ij,bj->b", drawn.numpy(), np.linalg.inv(covariance.numpy()), drawn.numpy())
     assert values.numpy() == pytest.approx(expected, rel=1e-6)
 
@@ -65,6 +69,7 @@ def test_normalized_error_without_an_inverse_is_no_finite_number() -> None:
     nothing = torch.zeros((6, 6), dtype=torch.float64)
     xi = torch.ones(6, dtype=torch.float64)
     assert not normalized_error_squared(SE3.exp(xi), SE3.identity(), nothing).isfinite()
+    assert not bool(within(SE3.exp(xi), SE3.exp(xi), nothing))
 
 
 @given(tangents, tangents, tangents)

@@ -18,7 +18,7 @@ import tempfile
 import threading
 import time
 from base64 import b64encode
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Iterator
 from dataclasses import dataclass, field, replace
 from email.utils import formatdate
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -55,6 +55,7 @@ from bidnerf_core.localization import settings_of
 from bidnerf_core.registry import _declared
 from bombs import png_of
 from commands import Run, assert_refused
+from waiting import wait_until
 
 QUICK = {"max_steps": 3, "rays": 64}
 LIMITS = ServiceLimits(workers=1, queue=3, timeout=120.0, upload_timeout=0.5, max_megabytes=1.0, max_megapixels=1.0)
@@ -408,13 +409,6 @@ def test_requests_beyond_the_bound_are_turned_away(service: Service, inputs: Inp
         assert int(reply.headers["retry-after"]) >= 1
         assert service.get("/health").status == 200
     assert service.post("/localize?map=map", inputs.photo).status == 422
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    until = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < until
-        time.sleep(0.01)
 
 
 @contextlib.contextmanager

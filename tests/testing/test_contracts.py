@@ -120,32 +120,11 @@ def stretched(view: View) -> View:
     return replace(view, T_ref_camera=SE3(1.1 * T.rotation, T.translation))
 
 
-@pytest.mark.parametrize(
-    ("mistake", "test", "says"),
-    [
-        (reversed_axes, "test_axes_are_those_of_opencv", "x right, y down and z forward"),
-        (millimetres, "test_depth_has_the_unit_of_the_poses", "times the depth that the poses"),
-        (stretched, "test_poses_are_rigid", "not a rigid transform"),
-    ],
-)
-def test_a_mistake_of_a_reader_is_named(
-    capture: Path, monkeypatch: pytest.MonkeyPatch, mistake: Any, test: str, says: str
-) -> None:
-    monkeypatch.setitem(registered, ("readers", "mistaken"), Converting(mistake))
-    assert says in fault_of(ReaderContract, test, name="mistaken", folder=capture)
-
-
 class Deaf(Converting):
     """A reader that ignores its options."""
 
     def read(self, path: Path, options: DatasetOptions) -> Capture:
         return super().read(path, DatasetOptions())
-
-
-def test_a_reader_that_ignores_its_options_is_named(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(registered, ("readers", "mistaken"), Deaf(lambda view: view))
-    test = "test_background_is_the_one_that_is_asked_for"
-    assert "the background is" in fault_of(ReaderContract, test, name="mistaken", folder=capture)
 
 
 def poser_by(change: Callable[[SE3], SE3]) -> Poser:
@@ -193,19 +172,6 @@ def everywhere(rgb: Float[Tensor, "h w 3"]) -> Keypoints:
     return Keypoints(torch.stack([rows, rows], -1), rows + 1, torch.zeros((20, 8), dtype=torch.uint8))
 
 
-@pytest.mark.parametrize(
-    ("detector", "test"),
-    [
-        (shifted, "test_keypoints_move_with_the_image"),
-        (shifted, "test_same_image_gives_the_same_keypoints"),
-        (everywhere, "test_blank_image_has_no_keypoints"),
-    ],
-)
-def test_a_mistake_of_a_detector_is_named(monkeypatch: pytest.MonkeyPatch, detector: Any, test: str) -> None:
-    monkeypatch.setitem(registered, ("features", "mistaken"), detector)
-    assert "expected" in fault_of(FeaturesContract, test, name="mistaken")
-
-
 def credulous(problem: Problem, config: AutoConfig, seed: int) -> Localization:
     """Accept one pose for every image."""
     pose = SE3.identity()
@@ -217,19 +183,6 @@ def fickle(problem: Problem, config: AutoConfig, seed: int) -> Localization:
     return replace(found, T_world_camera=found.T_world_camera.retract(1e-3 * torch.randn(6).double()))
 
 
-@pytest.mark.parametrize(
-    ("solve", "test", "said"),
-    [
-        (credulous, "test_image_of_another_scene_is_rejected", "another scene is accepted"),
-        (credulous, "test_pose_is_found", "is off by"),
-        (fickle, "test_same_seed_gives_the_same_pose", "different poses"),
-    ],
-)
-def test_a_mistake_of_a_method_is_named(monkeypatch: pytest.MonkeyPatch, solve: Any, test: str, said: str) -> None:
-    monkeypatch.setitem(registered, ("methods", "mistaken"), replace(find_method("auto"), solve=solve))
-    assert said in fault_of(MethodContract, test, name="mistaken", config=QUICK)
-
-
 def in_place(frame: Frame, size: float, generator: Generator) -> Frame:
     require(frame.depth).mul_(size)
     return frame
@@ -239,10 +192,39 @@ def unseeded(frame: Frame, size: float, generator: Generator) -> Frame:
     return replace(frame, rgb=(frame.rgb + (size - 1) * torch.rand(1)).clamp(0, 1))
 
 
+def solved_by(solve: Any) -> Any:
+    return replace(find_method("auto"), solve=solve)
+
+
+def changed_by(change: Any) -> Any:
+    return replace(FAULTS.load("exposure"), change=change)
+
+
 @pytest.mark.parametrize(
-    ("change", "test"),
-    [(in_place, "test_given_image_is_left_alone"), (unseeded, "test_same_seed_gives_the_same_image")],
+    ("group", "contract", "mistaken", "test", "says"),
+    [
+        ("readers", ReaderContract, Converting(reversed_axes), "axes_are_those_of_opencv", "x right, y down and z"),
+        ("readers", ReaderContract, Converting(millimetres), "depth_has_the_unit_of_the_poses", "times the depth that"),
+        ("readers", ReaderContract, Converting(stretched), "poses_are_rigid", "not a rigid transform"),
+        (
+            "readers",
+            ReaderContract,
+            Deaf(lambda view: view),
+            "background_is_the_one_that_is_asked_for",
+            "background is",
+        ),
+        ("features", FeaturesContract, shifted, "keypoints_move_with_the_image", "expected"),
+        ("features", FeaturesContract, shifted, "same_image_gives_the_same_keypoints", "expected"),
+        ("features", FeaturesContract, everywhere, "blank_image_has_no_keypoints", "expected"),
+        ("methods", MethodContract, solved_by(credulous), "image_of_another_scene_is_rejected", "scene is accepted"),
+        ("methods", MethodContract, solved_by(credulous), "pose_is_found", "is off by"),
+        ("methods", MethodContract, solved_by(fickle), "same_seed_gives_the_same_pose", "different poses"),
+        ("faults", FaultContract, changed_by(in_place), "given_image_is_left_alone", "expected"),
+        ("faults", FaultContract, changed_by(unseeded), "same_seed_gives_the_same_image", "expected"),
+    ],
 )
-def test_a_mistake_of_a_fault_is_named(monkeypatch: pytest.MonkeyPatch, change: Any, test: str) -> None:
-    monkeypatch.setitem(registered, ("faults", "mistaken"), replace(FAULTS.load("exposure"), change=change))
-    assert "expected" in fault_of(FaultContract, test, name="mistaken")
+def test_a_mistake_of_a_plugin_is_named(
+    capture: Path, monkeypatch: pytest.MonkeyPatch, group: str, contract: type, mistaken: Any, test: str, says: str
+) -> None:
+    monkeypatch.setitem(registered, (group, "mistaken"), mistaken)
+    assert says in fault_of(contract, f"test_{test}", name="mistaken", folder=capture, config=QUICK)

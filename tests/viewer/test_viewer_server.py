@@ -8,7 +8,7 @@ import io
 import json
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from bidnerf_core.localization import settings_of
 from bombs import png_of
 from photo_room import CAMERA
 from viewer_client import Client, serving
+from waiting import wait_until
 
 TOKEN = "a-token-of-enough-characters"
 VIEW = {"pose": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], "fov": 60, "width": 32, "height": 24}
@@ -44,19 +45,11 @@ def client(room: Map) -> Iterator[Client]:
         yield found
 
 
-def until(condition: Callable[[], bool]) -> None:
-    """Wait for something that comes soon."""
-    end = time.monotonic() + 120
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.02)
-
-
 def answer_of(client: Client, reply: Any) -> Any:
     """Wait for the answer that a reply promises."""
     assert reply.status_code == 202, reply.text
     job = f"/api/job/{reply.json()['job']}"
-    until(lambda: client.get(job).json()["state"] == "done")
+    wait_until(lambda: client.get(job).json()["state"] == "done")
     return client.get(job).json()["answer"]
 
 
@@ -160,7 +153,7 @@ def test_photos_beyond_the_bound_are_refused_before_they_are_read(room: Map) -> 
             connection.putrequest("POST", "/api/photo")
             connection.putheader("Content-Length", "1000")
             connection.endheaders(b"x")
-        until(lambda: client.post("/api/photo", b"x").status_code == 429)
+        wait_until(lambda: client.post("/api/photo", b"x").status_code == 429)
         assert client.get("/health").status_code == 200
 
 
@@ -181,7 +174,7 @@ def test_closing_ends_the_localization_at_work(room: Map) -> None:
 
     running, waiting = asyncio.run(close_at_work())
     began = time.monotonic()
-    until(lambda: running.state == "done")
+    wait_until(lambda: running.state == "done")
     assert time.monotonic() - began < 20  # of hours; a busy machine takes seconds to end a step
     assert (require(running.answer)["outcome"], waiting.state) == ("stopped", "waiting")
 
