@@ -34,9 +34,9 @@ def run_backends(json: Json = False) -> None:
 
 
 def run_doctor(json: Json = False) -> None:
-    """Describe the installation, as a bug report needs it: versions, devices, extras and plugins.
+    """Describe the installation: versions, devices, extras and plugins.
 
-    The exit status is 1 if a package that bidnerf requires is missing, or has a version that is not supported.
+    A bug report needs this. The exit status is 1 if a package that bidnerf requires is missing, or has a version that is not supported.
     """
     needed = requirements()
     broken = [requirement for requirement in needed if not requirement.is_met]
