@@ -28,6 +28,7 @@ from bidnerf_core.mapping import (
     States,
     imaged,
     project,
+    rays_by_camera,
     rays_through,
 )
 from optional import require
@@ -124,6 +125,16 @@ def test_rays_through_a_pixel_are_projected_to_it() -> None:
     found = imaged(at, rays, torch.zeros(50, dtype=torch.float64))
     torch.testing.assert_close(found.image, pixels.expand(4, 50, 2), rtol=0, atol=1e-4)
     assert torch.equal(rays[..., 2], torch.ones_like(rays[..., 2]))
+
+
+def test_the_derivative_of_rays_by_the_camera_is_that_of_central_differences() -> None:
+    """Also far from the stated camera, where every correction counts."""
+    at, pixels = drawn(4, moving=False), 0.3 * random(50, 2).clamp(-2, 2)
+    at = replace(
+        at, z=at.z + at.z.new_tensor([0.2, 0.05, -0.05, 0.1, 0.05, 0.02, *[0.0] * 7]) / at.deviation.clamp(min=1e-9)
+    )
+    expected = derivative(lambda states: rays_through(states, pixels), at)[..., 6:12]
+    torch.testing.assert_close(rays_by_camera(rays_through(at, pixels), at), expected, rtol=2e-3, atol=1e-5)
 
 
 def test_what_is_behind_the_camera_is_not_in_front() -> None:

@@ -194,22 +194,32 @@ def jacobian(states: States, seen: Projections, sights: Sights) -> Float[Tensor,
         back = sights.rotation.mT
         rig = (back @ (seen.local - sights.translation)[..., None])[..., 0]
         by_pose = _by_update((back @ by_point.transpose(1, 2)).transpose(1, 2), rig)
-    bent, zero = flat * seen.bend, torch.zeros_like(flat)
-    scaled = bent * seen.linear.diagonal(dim1=-2, dim2=-1)[:, None]
-    by_camera = torch.stack(
+    by_camera, zero = _by_camera(flat, seen.square, seen.bend, seen.linear), torch.zeros_like(flat)
+    by_motion = by_row * sights.times[..., None, :, None]
+    found = torch.cat([by_pose, by_camera, by_motion, zero[:, None]], 1)
+    found[:, 6:] *= states.deviation[:, :, None, None]
+    return found
+
+
+def _by_camera(
+    flat: Float[Tensor, "h m 2"],
+    square: Float[Tensor, "h m 1"],
+    bend: Float[Tensor, "h m 1"],
+    A: Float[Tensor, "h 2 2"],
+) -> Float[Tensor, "h 6 m 2"]:
+    """Return the derivative of the image with respect to the camera's nuisances; the arguments are fields of ``Projections``."""
+    bent = flat * bend
+    scaled = bent * A.diagonal(dim1=-2, dim2=-1)[:, None]
+    return torch.stack(
         [
             scaled,
             *(constant(e, flat).expand_as(flat) for e in ((1.0, 0.0), (0.0, 1.0))),
-            (flat * seen.square) @ A,
+            (flat * square) @ A.mT,
             scaled * constant((0.5, -0.5), flat),
             pad(bent[..., 1:], (0, 1)),
         ],
         1,
     )
-    by_motion = by_row * sights.times[..., None, :, None]
-    found = torch.cat([by_pose, by_camera, by_motion, zero[:, None]], 1)
-    found[:, 6:] *= states.deviation[:, :, None, None]
-    return found
 
 
 def _by_update(by_point: Float[Tensor, "h 3 m k"], points: Float[Tensor, "h m 3"]) -> Float[Tensor, "h 6 m k"]:
@@ -276,17 +286,16 @@ def rays_through(states: States, image: Float[Tensor, "m 2"]) -> Float[Tensor, "
 
 
 def rays_by_camera(rays: Float[Tensor, "h m 3"], states: States) -> Float[Tensor, "h m 3 6"]:
-    """Return the derivative of ``rays_through`` with respect to the camera's (whitened) nuisances, to first order."""
-    flat = rays[..., :2]
-    one, zero = torch.ones_like(flat[..., :1]), torch.zeros_like(flat[..., :1])
+    """Return the derivative of ``rays_through`` with respect to the camera's (whitened) nuisances.
+
+    The image does not move, so that ``flat`` moves by ``-(A (bend + 2 k1 flat flat^T))^-1`` times the derivative of ``_by_camera``.
+    """
+    flat, k1 = rays[..., :2], states.nuisances[:, None, 3:4]
     square = flat.square().sum(-1, keepdim=True)
-    columns = [
-        flat,
-        torch.cat([one, zero], -1),
-        torch.cat([zero, one], -1),
-        flat * square,
-        flat * constant((0.5, -0.5), flat),
-        torch.cat([flat[..., 1:], zero], -1),
-    ]
-    found = -torch.stack(columns, -1) * states.deviation[:, None, None, CAMERA]
-    return torch.cat([found, torch.zeros_like(found[..., :1, :])], -2)
+    bend, A = 1 + k1 * square, linear(states)
+    (a, c), (_, b) = (row.unbind(-1) for row in A[:, None, None].unbind(-2))
+    x, y = _by_camera(flat, square, bend, A).transpose(1, 2).unbind(-1)  # h m 6
+    moved = torch.stack([(x - c * y / b) / a, y / b], -2) / bend[..., None]
+    # The inverse of ``bend + 2 k1 flat flat^T`` by Sherman and Morrison 1950.
+    inward = (2 * k1 / (bend + 2 * k1 * square))[..., None] * flat[..., None] * (flat[..., None, :] @ moved)
+    return pad((inward - moved) * states.deviation[:, None, None, CAMERA], (0, 0, 0, 1))
