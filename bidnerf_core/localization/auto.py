@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from typing import Any
 
 import torch
 
@@ -21,6 +22,7 @@ from bidnerf_core.localization.by_surface import localize_by_depth, localize_by_
 from bidnerf_core.localization.explanations import CAMERAS
 from bidnerf_core.localization.loop import LandmarkAnswer, Loop
 from bidnerf_core.localization.methods import METHODS, Method
+from bidnerf_core.localization.posterior import mass_within
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict, current_record
 from bidnerf_core.localization.settings import AutoConfig
@@ -48,7 +50,7 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     if problem.matcher is None and problem.surface is not None and not (found.converged or is_blank):
         found = replace(found, reason=f"{found.reason}; the map has no landmarks ('bidnerf bake' makes them)")
     found = replace(found, seconds=time.perf_counter() - began)
-    return within_risk(found, config.risk)
+    return within_limits(found, config)
 
 
 def localize_by_landmarks(problem: Problem, rays: int, seed: int) -> Localization:
@@ -154,6 +156,21 @@ def within_risk(found: Localization, risk: float | None) -> Localization:
         return found
     why = f"the confidence is {'unknown' if known is None else format(known, '.3f')}, a risk of {risk:g} requires {least:.3f}"
     return found.rejected(Verdict(Outcome.UNCERTAIN, why, found.confidence))
+
+
+def within_limits(found: Localization, config: Any) -> Localization:
+    """Return the answer, rejected as ``uncertain`` if it does not keep the ``tolerance`` or the ``risk`` of the settings, if they have any.
+
+    It keeps the tolerance if its covariance puts four fifths of the probability within it, and within 0.05 radians.
+    """
+    tolerance: float | None = getattr(config, "tolerance", None)
+    if tolerance is not None and found.converged and found.covariance is not None:
+        one = torch.ones(1, dtype=torch.float64)
+        mass = mass_within(one, torch.zeros((1, 6)).double(), found.covariance[None], tolerance)
+        if mass < 0.8:
+            why = f"the position is right within {tolerance:g} with a probability of {mass:.0%}, expected at least 80%"
+            found = found.rejected(Verdict(Outcome.UNCERTAIN, why, found.confidence))
+    return within_risk(found, getattr(config, "risk", None))
 
 
 AUTO = Method(

@@ -163,19 +163,19 @@ class Posterior:
         covariance added to the covariances of all explanations.
         """
         weight = self.probability * credible
-        return mass_within(weight, self.update - self.mean, self.covariance + shared, distance)
+        return mass_within(weight, self.update - self.mean, self.covariance + shared, TOLERANCE * distance)
 
 
 def mass_within(
-    weight: Float[Tensor, "h"], off: Float[Tensor, "h 6"], covariance: Float[Tensor, "h 6 6"], distance: float
+    weight: Float[Tensor, "h"], off: Float[Tensor, "h 6"], covariance: Float[Tensor, "h 6 6"], tolerance: float
 ) -> float:
-    """Return the mass of a Gaussian mixture of updates of at most 0.05 rad and at most ``TOLERANCE * distance`` (metres)."""
+    """Return the mass of a Gaussian mixture of updates of at most 0.05 rad and at most ``tolerance`` (metres)."""
     sane = covariance.isfinite().all(-1).all(-1)
     factor, info = torch.linalg.cholesky_ex(
         torch.where(sane[:, None, None], covariance, torch.eye(6, dtype=covariance.dtype))
     )
     drawn = off[:, None] + normal_draws() @ factor.mT
-    inside = (drawn[..., :3].norm(dim=-1) <= TOLERANCE * distance) & (drawn[..., 3:].norm(dim=-1) <= 0.05)
+    inside = (drawn[..., :3].norm(dim=-1) <= tolerance) & (drawn[..., 3:].norm(dim=-1) <= 0.05)
     return float((weight * inside.double().mean(-1) * (sane & (info == 0))).sum())  # host
 
 

@@ -69,6 +69,8 @@ class AutoConfig(Settings):
     depth_sensor: Annotated[str, OneOf(DEPTH_SENSORS)] = "unknown"
     # tolerated fraction of wrong answers among the accepted ones; None for the usual acceptance
     risk: float | None = None
+    # largest position error (in the map's unit) of a right pose; None: 3 % of the distance of the scene
+    tolerance: Positive | None = None
     # The rest is of searches by images, which end with steps on rendered rays, and of their acceptance by newly drawn rays.
     fine_steps: Annotated[int, Range(1, 10**5), EXPERT] = 8  # steps of the best pose, in full detail
     # number of rays rendered for each of the fine steps, and of fractions of it before

@@ -11,6 +11,7 @@ from itertools import pairwise
 from typing import Any
 
 import pytest
+import torch
 
 from bidnerf_core.localization import (
     ACCEPTED,
@@ -25,7 +26,7 @@ from bidnerf_core.localization import (
 
 # Inside: the verdict of a record of evidence, and the model without any answer
 from bidnerf_core.localization.accept import judge, least_confidence
-from bidnerf_core.localization.auto import within_risk
+from bidnerf_core.localization.auto import within_limits, within_risk
 from localizations import answer
 from optional import require
 from refusals import refused
@@ -203,3 +204,12 @@ def test_a_risk_that_was_not_calibrated_is_refused(risk: Any) -> None:
     is_number = isinstance(risk, float) and math.isfinite(risk)
     with refused(found=f"risk is {risk!r}", expected="0.01 to 0.1" if is_number else "float"):
         AutoConfig(risk=risk)
+
+
+@pytest.mark.parametrize(("tolerance", "accepted"), [(0.05, True), (0.02, False), (None, True)])
+def test_a_tolerance_rejects_what_is_less_certain(tolerance: float | None, accepted: bool) -> None:
+    """Of a Gaussian of 0.015 along each axis, 99 % lie within 0.05, and 38 % within 0.02."""
+    covariance = torch.diag(torch.tensor([0.015] * 3 + [0.001] * 3, dtype=torch.float64).square())
+    found = within_limits(replace(answer(), covariance=covariance), AutoConfig(tolerance=tolerance))
+    assert found.converged is accepted
+    assert accepted or "within 0.02 with a probability of 3" in found.reason

@@ -16,7 +16,7 @@ from bidnerf_core.fields import has_field
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import CORNERS_PER_INDEPENDENT, SE3, skew, update_between
 from bidnerf_core.localization.accept import Evidence, Support, judge
-from bidnerf_core.localization.auto import within_risk
+from bidnerf_core.localization.auto import within_limits
 from bidnerf_core.localization.explanations import STATED, Explanations, motion_prior
 from bidnerf_core.localization.loop import DEPTH_WIDTH
 from bidnerf_core.localization.matching import (
@@ -112,7 +112,7 @@ class Measurer:
     landmarks: LandmarkMap | None
     features: Features | None  # the detector of the map's keypoints
     sensor: DepthSensorModel
-    risk: float | None  # tolerated fraction of wrong answers among the accepted ones
+    config: Any  # settings of the localizer, whose limits apply
 
     @torch.no_grad()
     def __call__(self, frame: Frame, image: Grey | None, state: TrackerState, predicted: Motion) -> Measurement | None:
@@ -122,7 +122,7 @@ class Measurer:
         of the tracked landmarks or around the prediction.
         """
         measured = self._measured(frame, image, state, predicted)
-        return measured if measured is None else replace(measured, answer=within_risk(measured.answer, self.risk))
+        return measured if measured is None else replace(measured, answer=within_limits(measured.answer, self.config))
 
     def _measured(self, frame: Frame, image: Grey | None, state: TrackerState, predicted: Motion) -> Measurement | None:
         landmarks = self.landmarks
@@ -263,7 +263,7 @@ class Measurer:
             spread=len(cells(inliers.pixels, fit.camera).unique()) / CELLS**2,
             noise_ratio=noise / landmarks.noise,
             precision=_position_deviation(covariance) / distance,
-            mass=mass_within(one, torch.zeros((1, 6)).double(), covariance[None], distance),
+            mass=mass_within(one, torch.zeros((1, 6)).double(), covariance[None], TOLERANCE * distance),
             other_place=0.0,
             credible=1.0,
             replaced=0.0,

@@ -13,7 +13,7 @@ import torch
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.auto import localize_by_landmarks, within_risk
+from bidnerf_core.localization.auto import localize_by_landmarks, within_limits
 from bidnerf_core.localization.by_surface import is_blank
 from bidnerf_core.localization.localizer import NO_DISTANCES, Localizer, Start, start_pose
 from bidnerf_core.localization.problem import SceneMap, extent_of, origin_of, start_covariance, unit_of
@@ -64,8 +64,7 @@ class Tracker:
         self._landmarks = None if matcher is None else matcher.landmarks
         # The 600 strongest keypoints of an image are matched with landmarks.
         features = None if matcher is None else limit_features(matcher.features, 600)
-        self._risk = getattr(localizer.config, "risk", None)
-        self._measure = Measurer(self._scene, self._landmarks, features, localizer.depth_sensor, self._risk)
+        self._measure = Measurer(self._scene, self._landmarks, features, localizer.depth_sensor, localizer.config)
         self._extent = extent_of(self._scene)
 
     @property
@@ -221,7 +220,7 @@ class Tracker:
         problem = self.localizer.problem(frame, T if is_due else None)
         if self.localizer.matcher is not None and not is_due:
             problem = replace(problem, sensor=self.localizer.depth_sensor)
-            return within_risk(localize_by_landmarks(problem, 0, state.frames), self._risk)
+            return within_limits(localize_by_landmarks(problem, 0, state.frames), self.localizer.config)
         try:
             return self.localizer.solve(problem, state.frames)
         except InputError:
