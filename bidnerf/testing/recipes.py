@@ -25,7 +25,10 @@ EXPOSURE = 0.06
 
 
 class Recorder:
-    """A ``Report`` that records progress and saved states; the states pass through safetensors, as in a map on disk."""
+    """A ``Report`` that records progress and saved states, and stops at the step ``stop``.
+
+    The states pass through safetensors, as in a map on disk.
+    """
 
     def __init__(self, due: Collection[int] = (), stop: int | None = None, state: TrainingState | None = None) -> None:
         self.steps: list[TrainingStep] = []
@@ -46,7 +49,7 @@ class Recorder:
 
     @property
     def stopping(self) -> bool:
-        return self._stop is not None and len(self.steps) >= self._stop
+        return self._stop is not None and bool(self.steps) and self.steps[-1].step >= self._stop
 
 
 def round_trip(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -8,12 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-import bidnerf_adanerf
-import bidnerf_vanilla
 import tiny
 from bidnerf.testing import SCENE_BOUNDS as BOUNDS
 from bidnerf.testing import check_intervals, check_repeatable, rgb_views
-from bidnerf_core.backend import Backend
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.fields import RadianceField, Rays, VoxelGrid, levels, render
 from bidnerf_core.frames import View
@@ -21,19 +18,14 @@ from bidnerf_core.training import Silent
 from bidnerf_hashgrid import backend as hashgrid
 from bidnerf_hashgrid.occupancy import OccupancyGrid
 from optional import require
+from small_backends import BACKENDS
 
 OPEN = replace(BOUNDS, far=200.0, contracted=True, background=(0.0, 0.0, 0.0))
-BACKENDS = {"hashgrid": hashgrid, "vanilla": bidnerf_vanilla.backend, "adanerf": bidnerf_adanerf.backend}
-CONFIGS = {
-    "hashgrid": tiny.config(),
-    "vanilla": bidnerf_vanilla.VanillaConfig(layers=3, width=16, skip=1, coarse_samples=16, fine_samples=8),
-    "adanerf": bidnerf_adanerf.AdaNerfConfig(width=16),
-}
 
 
 def built(name: str) -> RadianceField:
-    backend: Backend = BACKENDS[name]
-    field: RadianceField = backend.build(CONFIGS[name], OPEN)
+    backend, config = BACKENDS[name]
+    field: RadianceField = backend.build(config, OPEN)
     return field
 
 

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
-from bidnerf.scenes import demo_object
-from bidnerf.testing import ground
+from bidnerf.testing import Recorder, ground
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import render
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.training import Silent, Supervision, SupervisionConfig, TrainingStep, relative_detail
+from bidnerf_core.training import Supervision, SupervisionConfig, relative_detail
 from landmark_scene import looking_in
 from optional import require
-from test_supervision import BACKENDS
+from small_backends import BACKENDS, BOUNDS, train_field
 
-BOUNDS, COUNT, BLURRED = demo_object().bounds, 12, 5
+COUNT, BLURRED = 12, 5
 CAMERA = Intrinsics(100.0, 100.0, 48.0, 36.0, 96, 72)
 
 
@@ -54,28 +53,12 @@ def test_the_loss_is_that_of_weighted_squares() -> None:
     assert mse == pytest.approx(float(squares.mean()), rel=1e-5)
 
 
-@dataclass
-class FirstLoss(Silent):
-    """A report that keeps the loss of the first step."""
-
-    loss: float = float("nan")
-
-    def step(self, progress: TrainingStep) -> None:
-        if progress.step == 1:
-            self.loss = progress.loss
-
-
 @pytest.mark.parametrize("name", BACKENDS)
 def test_every_backend_weighs_blurred_photos_less(name: str) -> None:
-    backend, config = BACKENDS[name]
-
     def first_loss(blur: float, **changes: object) -> float:
-        report = FirstLoss()
-        settings = replace(config, steps=1, carve=False, **changes)  # type: ignore[type-var]
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)
-            backend.train(backend.build(settings, BOUNDS), photos(blur), settings, report)
-        return report.loss
+        report = Recorder()
+        train_field(name, photos(blur), report, steps=1, **changes)
+        return report.steps[0].loss
 
     assert first_loss(3.0) < 0.99 * first_loss(3.0, sharpness=False)
     assert first_loss(0.0) == first_loss(0.0, sharpness=False)

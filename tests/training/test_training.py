@@ -13,6 +13,7 @@ from torch import Generator, Tensor, nn
 
 import tiny
 from bidnerf.scenes import orbit
+from bidnerf.testing import Recorder
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.fields import SceneBounds
@@ -24,7 +25,6 @@ from bidnerf_core.training import (
     StepOutcome,
     TrainingBatch,
     TrainingState,
-    TrainingStep,
     TrainingStopped,
     cosine,
     fit,
@@ -36,30 +36,6 @@ from bidnerf_hashgrid import HashGridField, backend
 from refusals import refused
 
 BOUNDS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.5, 6.0, (0.2, 0.4, 0.6))
-
-
-class Kept(Silent):
-    """A report that stops at a step, keeps the state as a file would, and notes what it is told."""
-
-    def __init__(self, stop: int | None = None, begin: TrainingState | None = None) -> None:
-        self.stop, self.begin = stop, begin
-        self.stopping = False
-        self.saved: list[TrainingState] = []
-        self.told: list[TrainingStep] = []
-
-    def resume(self) -> TrainingState | None:
-        return self.begin
-
-    def step(self, progress: TrainingStep) -> None:
-        self.told.append(progress)
-        self.stopping = progress.step == self.stop
-
-    def due(self, step: int) -> bool:
-        return self.told[-1].step == self.told[-1].total
-
-    def save(self, state: TrainingState) -> None:
-        copies = ({name: value.clone() for name, value in part.items()} for part in (state.field, state.optimizer))
-        self.saved.append(TrainingState(state.step, *copies))
 
 
 def assert_equal(found: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
@@ -76,7 +52,7 @@ def scene() -> tuple[list[View], SceneBounds]:
     return views, estimate_bounds(views, tiny.BACKGROUND)
 
 
-def trained(scene: tuple[list[View], SceneBounds], report: Kept, **changes: Any) -> HashGridField:
+def trained(scene: tuple[list[View], SceneBounds], report: Recorder, **changes: Any) -> HashGridField:
     views, bounds = scene
     config = tiny.config(**changes)
     field = backend.build(config, bounds)
@@ -86,10 +62,9 @@ def trained(scene: tuple[list[View], SceneBounds], report: Kept, **changes: Any)
 
 @pytest.fixture(scope="module")
 def uninterrupted(scene: tuple[list[View], SceneBounds]) -> TrainingState:
-    report = Kept()
+    report = Recorder(due=[24])
     trained(scene, report, steps=24)
-    (state,) = report.saved
-    return state
+    return report.saved[0]
 
 
 @pytest.mark.parametrize("stops", [[1], [12], [23], [3, 4, 11]], ids=str)
@@ -99,15 +74,15 @@ def test_a_training_that_was_stopped_comes_to_the_same_end(
     """Bit by bit: weights, occupancy, moments, generator. Pruning begins at step 4, every fourth step is coarse."""
     state = None
     for stop in stops:
-        report = Kept(stop, state)
+        report = Recorder(stop=stop, state=state)
         with pytest.raises(TrainingStopped) as stopped:
             trained(scene, report, steps=24)
         assert stopped.value.step == stop
         (state,) = report.saved
         assert state.step == stop
-    report = Kept(begin=state)
+    report = Recorder(due=[24], state=state)
     trained(scene, report, steps=24)
-    assert [progress.step for progress in report.told] == list(range(stops[-1] + 1, 25))
+    assert [progress.step for progress in report.steps] == list(range(stops[-1] + 1, 25))
     (end,) = report.saved
     assert_equal(end.field, uninterrupted.field)
     assert_equal(end.optimizer, uninterrupted.optimizer)
@@ -122,26 +97,21 @@ def test_occupancy_changed_on_the_way(uninterrupted: TrainingState) -> None:
 
 
 def test_a_stop_requested_in_the_last_step_is_the_end(scene: tuple[list[View], SceneBounds]) -> None:
-    report = Kept(stop=3)
+    report = Recorder(due=[3], stop=3)
     trained(scene, report, steps=3)
     assert [state.step for state in report.saved] == [3]
 
 
-class Late(Kept):
+class Late(Recorder):
     """Asked to stop at the worst moment: when it was just asked whether to stop."""
 
-    def __init__(self, stop: int) -> None:
+    def __init__(self, asked: int) -> None:
         super().__init__()
-        self.late, self.asked = stop, 0
+        self.calm = iter([False] * asked)
 
     @property
     def stopping(self) -> bool:
-        self.asked += 1
-        return self.asked > self.late
-
-    @stopping.setter
-    def stopping(self, value: bool) -> None:
-        pass
+        return next(self.calm, True)
 
 
 @pytest.mark.parametrize("stop", [1, 2, 3, 4])
@@ -155,7 +125,7 @@ def test_a_training_stops_only_where_it_saved(stop: int) -> None:
 def test_the_same_seed_gives_the_same_field_and_another_another(
     scene: tuple[list[View], SceneBounds],
 ) -> None:
-    one, again, other = (trained(scene, Kept(), steps=3, seed=seed).state_dict() for seed in (0, 0, 1))
+    one, again, other = (trained(scene, Recorder(), steps=3, seed=seed).state_dict() for seed in (0, 0, 1))
     assert_equal(one, again)
     assert not torch.equal(one["geometry.0.weight"], other["geometry.0.weight"])
 
@@ -175,12 +145,12 @@ def line_outcome(line: nn.Linear) -> Any:
 
 
 def test_the_loop_minimises() -> None:
-    line, report = nn.Linear(1, 1), Kept()
+    line, report = nn.Linear(1, 1), Recorder()
     fit(line, [{"params": line.parameters(), "lr": 0.1}], line_outcome(line), 300, report)
     torch.testing.assert_close(line.weight.detach(), torch.tensor([[3.0]]), atol=0.05, rtol=0)
     torch.testing.assert_close(line.bias.detach(), torch.tensor([-1.0]), atol=0.05, rtol=0)
-    assert [progress.step for progress in report.told] == list(range(1, 301))
-    assert {progress.total for progress in report.told} == {300}
+    assert [progress.step for progress in report.steps] == list(range(1, 301))
+    assert {progress.total for progress in report.steps} == {300}
 
 
 def test_a_parameter_without_a_gradient_yet_is_resumed_too() -> None:
@@ -196,15 +166,15 @@ def test_a_parameter_without_a_gradient_yet_is_resumed_too() -> None:
         fit(pair, [{"params": pair.parameters(), "lr": 0.1}], outcome, 12, report)
         return pair.state_dict()
 
-    half = Kept(stop=3)
+    half = Recorder(stop=3)
     with pytest.raises(TrainingStopped):
         train(half)
-    assert_equal(train(Kept(begin=half.saved[0])), train(Silent()))
+    assert_equal(train(Recorder(state=half.saved[0])), train(Silent()))
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_a_loss_that_is_not_finite_ends_the_training_before_it_spreads(bad: float) -> None:
-    line, report = nn.Linear(1, 1), Kept()
+    line, report = nn.Linear(1, 1), Recorder()
 
     def outcome(step: int, generator: Generator) -> StepOutcome:
         return StepOutcome(line.weight.sum() * (bad if step == 2 else 1.0), 0.0)
@@ -213,7 +183,7 @@ def test_a_loss_that_is_not_finite_ends_the_training_before_it_spreads(bad: floa
         fit(line, [{"params": line.parameters(), "lr": 0.1}], outcome, 5, report)
     assert re.search(rf"loss -?{bad} at step 3", caught.error.found)
     assert bool(line.weight.isfinite().all())
-    assert [progress.step for progress in report.told] == [1, 2]
+    assert [progress.step for progress in report.steps] == [1, 2]
 
 
 def test_the_schedule_warms_up_and_then_falls_to_its_last_value() -> None:

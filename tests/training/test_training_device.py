@@ -13,8 +13,7 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core.carving import estimate_bounds
-from bidnerf_core.devices import move_to
+from bidnerf.testing import Recorder
 from bidnerf_core.fields import RaySamples, query_samples
 from bidnerf_core.frames import View
 from bidnerf_core.training import RayBank, TrainingStopped, ray_bank
@@ -22,11 +21,10 @@ from bidnerf_core.training import RayBank, TrainingStopped, ray_bank
 # Inside: steps without room for their samples
 from bidnerf_hashgrid import recipe
 from simulated_device import DEVICE, Elsewhere
-from test_supervision import BACKENDS, seen
-from test_training import Kept
+from small_backends import BACKENDS, BOUNDS, train_field
+from test_supervision import seen
 
 VIEWS = tiny.views(6)
-BOUNDS = estimate_bounds(VIEWS, tiny.BACKGROUND)
 # On a device, the sampler that concentrates samples draws random numbers for all rays.
 CHANGES: dict[str, dict[str, Any]] = {"hashgrid": {"samples_per_ray": 0, "rays_at_most": 32, "prune_from": 24}}
 
@@ -52,22 +50,16 @@ def elsewhere(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
 
 
 def trained(
-    name: str, report: Kept, device: torch.device | str = "cpu", views: list[View] = VIEWS, **changes: Any
-) -> Any:
-    backend, config = BACKENDS[name]
-    config = replace(config, **({"steps": 40, "rays_at_most": 64} | CHANGES.get(name, {}) | changes))
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        field: Any = backend.build(config, BOUNDS)
-    field = move_to(field, device)
-    backend.train(field, views, config, report)
-    return field
+    name: str, report: Recorder, device: torch.device | str = "cpu", views: list[View] = VIEWS, **changes: Any
+) -> None:
+    usual = {"rays_at_most": 64, "carve": True} | CHANGES.get(name, {})
+    train_field(name, views, report, device, **(usual | changes))
 
 
 @functools.cache
-def on_device(name: str) -> tuple[Kept, int]:
+def on_device(name: str) -> tuple[Recorder, int]:
     """Return what a whole training on the device reported, and how many of its steps would be replayed."""
-    report = Kept()
+    report = Recorder()
     with pytest.MonkeyPatch.context() as patch, elsewhere(patch) as replays:
         trained(name, report, DEVICE)
     return report, len(replays)
@@ -75,12 +67,12 @@ def on_device(name: str) -> tuple[Kept, int]:
 
 @pytest.mark.parametrize("name", BACKENDS)
 def test_steps_on_a_device_do_not_wait_and_are_those_of_the_cpu(name: str) -> None:
-    here, (there, replays) = Kept(), on_device(name)
+    here, (there, replays) = Recorder(), on_device(name)
     trained(name, here)
     assert replays > 20
-    assert [step.step for step in there.told] == list(range(1, 41))
+    assert [step.step for step in there.steps] == list(range(1, 41))
     for part in ("loss", "psnr", "samples_per_ray"):
-        found, expected = (torch.tensor([getattr(s, part) for s in r.told]) for r in (there, here))
+        found, expected = (torch.tensor([getattr(s, part) for s in r.steps]) for r in (there, here))
         torch.testing.assert_close(found, expected, rtol=2e-3, atol=1e-5)
 
 
@@ -93,23 +85,23 @@ def test_masks_landmarks_motion_and_exposure_are_drawn_without_waiting(
         hidden[number:, ::3] = True
         changed = replace(seen(view, 7), motion=torch.full((6,), 0.01, dtype=torch.float64))
         views.append(replace(changed, frame=replace(changed.frame, alpha=None, hidden=hidden)))
-    here, there = Kept(), Kept()
+    here, there = Recorder(), Recorder()
     trained("vanilla", here, "cpu", views, distortion_weight=0.1, steps=20)
     with elsewhere(monkeypatch) as replays:
         trained("vanilla", there, DEVICE, views, distortion_weight=0.1, steps=20)
     assert len(replays) == 18
-    found, expected = (torch.tensor([step.loss for step in report.told]) for report in (there, here))
+    found, expected = (torch.tensor([step.loss for step in report.steps]) for report in (there, here))
     torch.testing.assert_close(found, expected, rtol=2e-3, atol=1e-5)
 
 
 def test_images_that_are_too_large_for_a_device_stay_on_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
-    here, there = Kept(), Kept()
+    here, there = Recorder(), Recorder()
     trained("vanilla", here, steps=20)
     monkeypatch.setattr(ray_bank, "_home_of", lambda *_: torch.device("cpu"))
     with elsewhere(monkeypatch) as replays:
         trained("vanilla", there, DEVICE, steps=20)
     assert not replays
-    found, expected = ([step.loss for step in report.told] for report in (there, here))
+    found, expected = ([step.loss for step in report.steps] for report in (there, here))
     assert found == pytest.approx(expected, rel=1e-3)
 
 
@@ -117,7 +109,7 @@ def test_images_that_are_too_large_for_a_device_stay_on_the_host(monkeypatch: py
 def test_a_training_on_a_device_resumes_there_and_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
     halves = []
     for device in ("cpu", DEVICE):
-        half = Kept(stop=20)
+        half = Recorder(stop=20)
         with elsewhere(monkeypatch), pytest.raises(TrainingStopped):
             trained("hashgrid", half, device)
         halves.append(half.saved[0])
@@ -125,10 +117,10 @@ def test_a_training_on_a_device_resumes_there_and_elsewhere(monkeypatch: pytest.
     whole, _ = on_device("hashgrid")
     with elsewhere(monkeypatch):
         for half in halves:
-            rest = Kept(begin=half)
+            rest = Recorder(state=half)
             trained("hashgrid", rest, DEVICE)
-            assert [step.step for step in rest.told] == list(range(half.step + 1, 41))
-            found, expected = ([s.loss for s in r.told][-8:] for r in (rest, whole))
+            assert [step.step for step in rest.steps] == list(range(half.step + 1, 41))
+            found, expected = ([s.loss for s in r.steps][-8:] for r in (rest, whole))
             assert found == pytest.approx(expected, rel=1e-4)
 
 
@@ -137,7 +129,7 @@ def test_samples_that_do_not_fit_are_reported(
 ) -> None:
     monkeypatch.setattr(recipe, "SPARE", 0.01)
     with elsewhere(monkeypatch), caplog.at_level(logging.INFO, "bidnerf"):
-        trained("hashgrid", Kept(), DEVICE, steps=8)
+        trained("hashgrid", Recorder(), DEVICE, steps=8)
     assert "samples did not fit" in caplog.text
 
 
