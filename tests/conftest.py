@@ -91,6 +91,15 @@ def generator() -> torch.Generator:
 
 
 @pytest.fixture
+def three_threads() -> Iterator[None]:
+    """Let torch use three threads, and restore the usual number afterwards."""
+    usual = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(usual)
+
+
+@pytest.fixture
 def bidnerf(capsys: pytest.CaptureFixture[str]) -> Run:
     """Runs a command in this process."""
     from bidnerf.cli import main

@@ -26,6 +26,7 @@ from bidnerf_core.training import RayBank, TrainingBatch
 from optional import require
 from simulated_device import StaysOnDevice
 from tiny import black_batch
+from trainings import assert_same_tensors
 
 SMALL = AdaNerfConfig(
     width=32,
@@ -303,8 +304,7 @@ def test_training_resumes_in_any_phase(at: int) -> None:
     backend.train(rest, rgbd_views(), config, resumed)
     assert [p.step for p in resumed.steps] == list(range(at + 1, 21))
     assert [p.loss for p in resumed.steps] == [p.loss for p in report.steps[at:]]
-    for name, value in whole.state_dict().items():
-        assert torch.equal(value, rest.state_dict()[name]), name
+    assert_same_tensors(rest.state_dict(), whole.state_dict())
 
 
 @pytest.mark.parametrize("depth", [True, False])

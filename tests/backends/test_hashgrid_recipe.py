@@ -1,6 +1,5 @@
 """Training of a hash-grid field: its threads, and its settings in contracted scenes."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
@@ -13,16 +12,11 @@ from bidnerf_core.training import Silent
 from bidnerf_hashgrid import HashGridConfig, HashGridField, backend
 from bidnerf_hashgrid.recipe import _visible, adapt
 from bidnerf_hashgrid.threads import THREADED, pools_only, threads_for
+from trainings import assert_same_tensors
 
 BOX = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 6.0)
 CPU = torch.device("cpu")
-
-
-@pytest.fixture(autouse=True)
-def usual_threads() -> Iterator[None]:
-    usual = torch.get_num_threads()
-    yield
-    torch.set_num_threads(usual)
+pytestmark = pytest.mark.usefixtures("three_threads")
 
 
 def trained(threads: int) -> HashGridField:
@@ -35,13 +29,10 @@ def trained(threads: int) -> HashGridField:
 
 
 def test_the_number_of_threads_does_not_change_what_is_learned() -> None:
-    one, three = trained(1).state_dict(), trained(3).state_dict()
-    for name, value in one.items():
-        assert torch.equal(value, three[name]), name
+    assert_same_tensors(trained(1).state_dict(), trained(3).state_dict())
 
 
 def test_pools_keep_the_threads_that_torch_gives_up() -> None:
-    torch.set_num_threads(3)
     with pools_only(CPU):
         assert torch.get_num_threads() == 1
         assert threads_for(THREADED, CPU) == 3
@@ -50,7 +41,6 @@ def test_pools_keep_the_threads_that_torch_gives_up() -> None:
 
 
 def test_pools_follow_torch_again_after_an_error() -> None:
-    torch.set_num_threads(3)
     with pytest.raises(KeyboardInterrupt), pools_only(CPU):
         raise KeyboardInterrupt
     assert torch.get_num_threads() == 3

@@ -16,6 +16,7 @@ from bidnerf_core.captures import pose_contradiction, prepare_views
 # Inside: every reading of poses is applied and taken back, also those that no message proposes
 from bidnerf_core.captures.pose_conventions import Y_AND_Z_REVERSED as REVERSED
 from bidnerf_core.captures.pose_conventions import PoseContradiction, readings
+from bidnerf_core.geometry import look_at
 from bidnerf_core.mapping import ImageKeypoints, detect_keypoints
 from landmark_scene import Points, looking_in, ring
 from optional import require
@@ -80,21 +81,12 @@ def test_few_images_tell_nothing() -> None:
     assert judged([with_axes(T, REVERSED) for T in true_poses(4)]) is None
 
 
-def looking_at(centre: list[float], target: list[float]) -> SE3:
-    """A camera with a level x axis, where y points down."""
-    place, aim = torch.tensor(centre, dtype=torch.float64), torch.tensor(target, dtype=torch.float64)
-    z = (aim - place) / (aim - place).norm()
-    x = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), z)
-    x = x / x.norm()
-    return SE3(torch.stack([x, torch.linalg.cross(z, x), z], dim=-1), place)
-
-
 def test_right_poses_before_a_wall_are_not_refused() -> None:
     """Two rotations fit the images of a plane, so rotations alone would contradict right poses."""
     points = Points(2 * COUNT, 0.4, 0.1)
     points.positions[:, 2] = 0
     places = [-2 + 0.3 * i for i in range(IMAGES)]
-    poses = [looking_at([x, -0.3, -3.0], [0.5 * x + 1, 0.0, 0.0]) for x in places]
+    poses = [look_at([x, -0.3, -3.0], [0.5 * x + 1, 0.0, 0.0], (0.0, -1.0, 0.0)) for x in places]
     assert pose_contradiction(seen_from(points, poses, poses)) is None
     given = [with_axes(T, REVERSED) for T in poses]
     found = pose_contradiction(seen_from(points, poses, given))

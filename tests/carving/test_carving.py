@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.geometry import SE3
+from bidnerf_core.geometry import SE3, look_at
 from optional import require
 
 CAMERA = Intrinsics(60.0, 58.0, 33.0, 23.0, 64, 48)
@@ -35,26 +34,13 @@ LOWER, UPPER = (-1.5, -1.5, -1.5), (1.5, 1.5, 1.5)
 SHAPE = (24, 26, 28)  # no whole number of blocks
 
 
-def looking_at(place: Sequence[float], target: Sequence[float]) -> SE3:
-    """A camera (OpenCV axes) upright in a world whose z is up."""
-    start = torch.tensor(place).double()
-    forward = torch.nn.functional.normalize(torch.tensor(target).double() - start, dim=0)
-    right = torch.nn.functional.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0, 1]).double()), dim=0)
-    return SE3(torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1), start)
-
-
-def ball_distance(view_from: SE3, rays: Float[Tensor, "h w 3"], radius: float) -> Float[Tensor, "h w"]:
-    """Planar z at which rays (z = 1, camera frame) meet a ball of the world from outside; NaN where they do not."""
-    middle = view_from.inverse().apply(torch.tensor(BALL).double())
-    a, b = (rays * rays).sum(-1), (rays @ middle)
-    return (b - (b * b - a * (middle @ middle - radius**2)).sqrt()) / a
-
-
 @functools.cache
 def ball_depth(place: tuple[float, ...], camera: Intrinsics, radius: float) -> Tensor:
-    """The depth image of the ball from a place; 0 beside it."""
+    """Planar depth of the ball, which lies in a world, seen from a place outside; 0 beside it."""
     rays = camera.unproject(camera.pixel_centres(torch.float64))
-    return ball_distance(looking_at(place, (0, 0, 0)), rays, radius).nan_to_num(0).float()
+    middle = look_at(place, (0, 0, 0)).inverse().apply(torch.tensor(BALL).double())
+    a, b = (rays * rays).sum(-1), (rays @ middle)
+    return ((b - (b * b - a * (middle @ middle - radius**2)).sqrt()) / a).nan_to_num(0).float()
 
 
 def ball_view(
@@ -67,7 +53,7 @@ def ball_view(
     z = ball_depth(place, camera, radius).clone()
     hit = (z > 0).float()
     frame = Frame("ball", hit[..., None].expand(*hit.shape, 3), camera, z if depth else None, hit if alpha else None)
-    return View(frame, looking_at(place, (0, 0, 0)))
+    return View(frame, look_at(place, (0, 0, 0)))
 
 
 def around(count: int = 8, distance: float = 4.0) -> list[tuple[float, float, float]]:
@@ -89,13 +75,10 @@ def middles(shape: tuple[int, int, int]) -> Float[Tensor, "nx ny nz 3"]:
     return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
 
 
-def half_diagonal(shape: tuple[int, int, int]) -> float:
-    return math.dist(LOWER, [low + (up - low) / n for n, low, up in zip(shape, LOWER, UPPER, strict=True)]) / 2
-
-
 def on_surface(shape: tuple[int, int, int] = SHAPE) -> Tensor:
     off = torch.linalg.vector_norm(middles(shape) - torch.tensor(BALL), dim=-1) - RADIUS
-    return off.abs() <= half_diagonal(shape)
+    far_corner = [low + (up - low) / n for n, low, up in zip(shape, LOWER, UPPER, strict=True)]
+    return off.abs() <= math.dist(LOWER, far_corner) / 2
 
 
 def inside(shape: tuple[int, int, int] = SHAPE) -> Tensor:
@@ -143,7 +126,7 @@ def test_unknown_depth_frees_nothing() -> None:
 def test_two_views_must_agree_where_there_are_two() -> None:
     free = ball_view((4, 0, 0), radius=0.01)  # sees next to nothing
     assert (~occupied_cells([free], LOWER, UPPER, SHAPE)).any()
-    elsewhere = replace(free, T_ref_camera=looking_at((40, 0, 0), (80, 0, 0)))
+    elsewhere = replace(free, T_ref_camera=look_at((40, 0, 0), (80, 0, 0)))
     assert occupied_cells([free, elsewhere], LOWER, UPPER, SHAPE).all()
     again = occupied_cells([free, free], LOWER, UPPER, SHAPE)
     assert torch.equal(again, occupied_cells([free], LOWER, UPPER, SHAPE))
@@ -280,7 +263,7 @@ def test_opaque_alpha_is_no_silhouette() -> None:
 
 def test_cameras_that_look_outward_are_in_the_box() -> None:
     views = ball_views(depth=False, alpha=False)
-    outward = [replace(v, T_ref_camera=looking_at(p, [2 * x for x in p])) for v, p in zip(views, around(), strict=True)]
+    outward = [replace(v, T_ref_camera=look_at(p, [2 * x for x in p])) for v, p in zip(views, around(), strict=True)]
     bounds = estimate_bounds(outward)
     places = torch.tensor(around()).double()
     assert holds(bounds, torch.cat([places, places * 2])) == 1
@@ -290,7 +273,7 @@ def test_cameras_that_look_outward_are_in_the_box() -> None:
 def test_cameras_that_look_one_way_see_the_box_before_them() -> None:
     """A capture of a wall: parallel axes do not meet."""
     view = ball_view((4, 0, 0), depth=False, alpha=False)
-    views = [replace(view, T_ref_camera=looking_at((4, 0.1 * i, 0), (0, 0.1 * i, 0))) for i in range(5)]
+    views = [replace(view, T_ref_camera=look_at((4, 0.1 * i, 0), (0, 0.1 * i, 0))) for i in range(5)]
     bounds = estimate_bounds(views)
     assert bounds.lower[0] < 4 - 1
     assert bounds.upper[0] == pytest.approx(4)

@@ -1,6 +1,5 @@
 """One thread for torch's operators, in one Python thread at a time."""
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
 
@@ -9,13 +8,7 @@ import torch
 
 from bidnerf_core.devices import set_threads_here, threads_at_most
 
-
-@pytest.fixture(autouse=True)
-def three_threads() -> Iterator[None]:
-    usual = torch.get_num_threads()
-    torch.set_num_threads(3)
-    yield
-    torch.set_num_threads(usual)
+pytestmark = pytest.mark.usefixtures("three_threads")
 
 
 def in_new_thread() -> int:

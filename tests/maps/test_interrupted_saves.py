@@ -31,7 +31,7 @@ from bidnerf_core.localization.tracking.motion import Clock
 from bidnerf_core.localization.tracking.state import TrackerState, save_state
 from bidnerf_core.maps import load_info, load_map, write_parts
 from interruptions import FULL, Stopped, outcomes
-from test_storage import CAMERAS, PARTS, info, names, plain, save_part, state
+from test_storage import CAMERAS, PARTS, assert_holds, info, names, plain, save_part, state
 from trial_results import trial_result
 
 CAMERA = bn.Intrinsics(8.0, 8.0, 4.0, 3.0, 8, 6)
@@ -60,6 +60,21 @@ def part_of_a_map(name: str) -> Saver:
     return save, read
 
 
+def whole_map(complete: bool) -> Saver:
+    def save(folder: Path, number: int) -> None:
+        write_parts(folder, info(number, complete), state(number))
+
+    def read(folder: Path) -> object:
+        if not names(folder):
+            return None
+        loaded = load_map(folder)
+        assert_holds(loaded, state(loaded.info.step))
+        assert names(folder) == {"map.json", loaded.info.weights, loaded.info.training} - {None}
+        return loaded.info.step
+
+    return save, read
+
+
 def posed(path: Path, number: int) -> None:
     bn.write_poses(path, [PosedImage(f"{n}", n, CAMERA, POSE) for n in range(number)])
 
@@ -77,6 +92,8 @@ def results(path: Path, number: int) -> None:
 
 
 SAVERS: dict[str, Saver] = {
+    "map": whole_map(complete=True),
+    "checkpoint": whole_map(complete=False),
     **{name: part_of_a_map(name) for name in PARTS},
     "bytes": file("x", lambda path, n: write_file(path, bytes(n))),
     **{f"poses{ending}": file(f"poses{ending}", posed) for ending in POSE_WRITERS if "scanner" not in ending},
@@ -127,6 +144,8 @@ def test_a_save_that_fails_at_any_write_leaves_whole_files(
             assert before or name.startswith("poses") or names(folder) == names(old)
     new = seen[-1][1]
     assert new not in (None, kept)
-    assert len(seen) > 3  # open, sync, replace, and sync the folder
+    assert len(seen) > {"map": 8, "checkpoint": 12}.get(
+        name, 3
+    )  # open, sync, replace, and sync the folder, of each file
     for raised, found in seen:
         assert found == new or (found == kept and raised is not None)

@@ -27,6 +27,7 @@ from bidnerf_core.registry import PluginError
 from bidnerf_hashgrid import backend as hashgrid
 from optional import require
 from refusals import refused
+from trainings import assert_same_tensors
 
 BAKE = BakeConfig(cells=5000)
 DESCENT = settings_of("bid", {"rays": 64, "max_steps": 3})
@@ -50,9 +51,7 @@ def answer(scene: bn.Map, method: str = "bid") -> bn.Localization:
 def assert_same_field(one: bn.Map, other: bn.Map) -> None:
     assert isinstance(one.field, nn.Module)
     assert isinstance(other.field, nn.Module)
-    a, b = one.field.state_dict(), other.field.state_dict()
-    assert a.keys() == b.keys()
-    assert [name for name in a if not torch.equal(a[name], b[name])] == []
+    assert_same_tensors(one.field.state_dict(), other.field.state_dict())
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Maps on disk: what is saved is what is loaded, and whenever writing stops, one whole map is there."""
+"""Maps on disk: what is saved is what is loaded, and what is damaged is named."""
 
 from __future__ import annotations
 
@@ -47,10 +47,11 @@ from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import HashGridField, backend
 from commands import Run
 from drawn import poses, record, shares
-from interruptions import FULL, Stopped, outcomes, striking
+from interruptions import FULL, striking
 from landmark_scene import Points, ring
 from optional import require
 from refusals import refused
+from trainings import assert_same_tensors
 
 BOUNDS = SceneBounds((-0.1, -1 / 3, -1.0), (1.0, 2 / 3, 1e-17), 0.1, 5.0, (1.0, 0.5, 0.0))
 
@@ -86,16 +87,9 @@ def state(step: int = 5) -> TrainingState:
     return TrainingState(step, field(step).state_dict(), moments)
 
 
-def assert_equal(found: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
-    assert found.keys() == expected.keys()
-    for name, value in expected.items():
-        assert found[name].dtype == value.dtype
-        assert torch.equal(found[name], value), name
-
-
 def assert_holds(loaded: Map, expected: TrainingState) -> None:
     assert isinstance(loaded.field, nn.Module)
-    assert_equal(loaded.field.state_dict(), expected.field)
+    assert_same_tensors(loaded.field.state_dict(), expected.field)
 
 
 def names(folder: Path) -> set[str]:
@@ -140,8 +134,8 @@ def test_what_is_saved_is_what_is_loaded(complete: bool, tmp_path: Path) -> None
     else:
         resumed = load_state(tmp_path / "a" / "map", saved, field(1))
         assert resumed.step == 5
-        assert_equal(resumed.field, state().field)
-        assert_equal(resumed.optimizer, state().optimizer)
+        assert_same_tensors(resumed.field, state().field)
+        assert_same_tensors(resumed.optimizer, state().optimizer)
 
 
 rows = poses().map(lambda T: tuple(map(tuple, T.matrix().tolist())))
@@ -202,50 +196,6 @@ def test_old_files_are_removed_and_others_are_left_alone(tmp_path: Path) -> None
     assert names(tmp_path) == {*mine, "map.json", saved.weights, require(saved.training)}
     done = write_parts(tmp_path, info(step=7, complete=True), state(7))
     assert names(tmp_path) == {*mine, "map.json", done.weights}
-
-
-# Whenever the writing stops, the folder holds one whole map.
-
-
-@pytest.mark.parametrize("error", [FULL, Stopped()], ids=["full", "stop"])
-@pytest.mark.parametrize("complete", [True, False], ids=["complete", "checkpoint"])
-@pytest.mark.parametrize("before", [True, False], ids=["second save", "first save"])
-def test_a_save_that_stops_anywhere_leaves_a_whole_map(
-    before: bool, complete: bool, error: BaseException, tmp_path: Path
-) -> None:
-    places = (tmp_path / str(number) for number in itertools.count())
-    folder = tmp_path
-
-    def attempt() -> None:
-        nonlocal folder
-        folder = next(places)
-        folder.mkdir()
-        if before:
-            with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(store, "write_file", Path.write_bytes)  # not counted
-                write_parts(folder, info(step=5), state(5))
-        write_parts(folder, info(step=6, complete=complete), state(6))
-
-    steps = []
-    for raised in outcomes(attempt, error):
-        if isinstance(raised, OSError):
-            assert str(raised.filename).startswith(str(folder))
-        if before or (folder / "map.json").exists():
-            steps.append((raised, assert_whole(folder)))
-        else:
-            steps.append((raised, 5))
-            assert names(folder) == set()
-    assert steps[-1] == (None, 6)
-    assert len(steps) > (8 if complete else 12)  # open, sync, replace and sync again, of two files or three
-    assert all(step == 6 for raised, step in steps if raised is None)
-    assert all(step == 5 for raised, step in steps if isinstance(raised, OSError))
-
-
-def assert_whole(folder: Path) -> int:
-    loaded = load_map(folder)
-    assert_holds(loaded, state(loaded.info.step))
-    assert names(folder) == {"map.json", loaded.info.weights, loaded.info.training} - {None}
-    return loaded.info.step
 
 
 @pytest.mark.parametrize("times", [1, 100])

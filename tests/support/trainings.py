@@ -1,13 +1,15 @@
-"""What tests of interrupted trainings share: the interruption, and the comparison of the maps that come of them."""
+"""What tests of trainings share: an interruption, and the comparison of what they come to."""
 
 from __future__ import annotations
 
 import signal
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 import torch
 from safetensors.torch import load_file
+from torch import Tensor
 
 from bidnerf_core.maps import Checkpoints, load_info
 from bidnerf_core.training import TrainingStep
@@ -25,9 +27,16 @@ def stop_at(patch: pytest.MonkeyPatch, number: int) -> None:
     patch.setattr(Checkpoints, "step", step)
 
 
+def assert_same_tensors(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
+    """Assert that tensors have the same names and types, and are equal bit by bit."""
+    assert found.keys() == expected.keys()
+    kinds = {name: value.dtype for name, value in expected.items()}
+    assert [name for name, kind in kinds.items() if found[name].dtype != kind] == []
+    assert [name for name, value in expected.items() if not torch.equal(found[name], value)] == []
+
+
 def assert_same_map(one: Path, other: Path) -> None:
     """Assert that weights and occupancy are equal bit by bit."""
     a, b = load_file(one / load_info(one).weights), load_file(other / load_info(other).weights)
-    assert a.keys() == b.keys()
     assert any("occupied" in name for name in a)
-    assert [name for name in a if not torch.equal(a[name], b[name])] == []
+    assert_same_tensors(a, b)

@@ -34,13 +34,9 @@ from bidnerf_core.training import (
 from bidnerf_core.training.ray_bank import MEASURED_SHARE
 from bidnerf_hashgrid import HashGridField, backend
 from refusals import refused
+from trainings import assert_same_tensors
 
 BOUNDS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.5, 6.0, (0.2, 0.4, 0.6))
-
-
-def assert_equal(found: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
-    assert found.keys() == expected.keys()
-    assert [name for name, value in expected.items() if not torch.equal(found[name], value)] == []
 
 
 # Resuming without loss.
@@ -84,8 +80,8 @@ def test_a_training_that_was_stopped_comes_to_the_same_end(
     trained(scene, report, steps=24)
     assert [progress.step for progress in report.steps] == list(range(stops[-1] + 1, 25))
     (end,) = report.saved
-    assert_equal(end.field, uninterrupted.field)
-    assert_equal(end.optimizer, uninterrupted.optimizer)
+    assert_same_tensors(end.field, uninterrupted.field)
+    assert_same_tensors(end.optimizer, uninterrupted.optimizer)
 
 
 def test_occupancy_changed_on_the_way(uninterrupted: TrainingState) -> None:
@@ -126,7 +122,7 @@ def test_the_same_seed_gives_the_same_field_and_another_another(
     scene: tuple[list[View], SceneBounds],
 ) -> None:
     one, again, other = (trained(scene, Recorder(), steps=3, seed=seed).state_dict() for seed in (0, 0, 1))
-    assert_equal(one, again)
+    assert_same_tensors(one, again)
     assert not torch.equal(one["geometry.0.weight"], other["geometry.0.weight"])
 
 
@@ -169,7 +165,7 @@ def test_a_parameter_without_a_gradient_yet_is_resumed_too() -> None:
     half = Recorder(stop=3)
     with pytest.raises(TrainingStopped):
         train(half)
-    assert_equal(train(Recorder(state=half.saved[0])), train(Silent()))
+    assert_same_tensors(train(Recorder(state=half.saved[0])), train(Silent()))
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
