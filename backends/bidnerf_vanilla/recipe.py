@@ -11,7 +11,7 @@ from torch import Generator
 
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields import device_of, render
+from bidnerf_core.fields import device_of
 from bidnerf_core.frames import View
 from bidnerf_core.settings import Count, Positive, Range
 from bidnerf_core.training import (
@@ -20,7 +20,6 @@ from bidnerf_core.training import (
     StepOutcome,
     Supervision,
     SupervisionConfig,
-    TrainingBatch,
 )
 from bidnerf_vanilla.field import FieldConfig, VanillaField
 
@@ -54,21 +53,11 @@ def train(field: VanillaField, views: Sequence[View], config: VanillaConfig, rep
     rays_per_step = _rays_per_step(field, supervision, config)
 
     def outcome(step: int, generator: Generator) -> StepOutcome:
-        return step_outcome(field, supervision, supervision.draw(rays_per_step, generator), generator)
+        return supervision.step(field, rays_per_step, generator)  # eq. 6
 
     groups = [{"params": list(field.parameters()), "lr": config.learning_rate}]
     steps = Replayable(lambda step: "all steps are alike", outcome)
     supervision.fit(field, groups, steps, config.steps, report, seed=config.seed)
-
-
-def step_outcome(
-    field: VanillaField, supervision: Supervision, batch: TrainingBatch, generator: Generator
-) -> StepOutcome:
-    """Return the loss of both levels (eq. 6), and the mean squared colour error and samples per ray of the fine level."""
-    coarse, fine = (render(level, batch.rays, batch.background, generator) for level in field.levels)
-    rough, _ = supervision.loss(coarse, batch)
-    loss, mse = supervision.loss(fine, batch)
-    return StepOutcome(rough + loss, mse, fine.samples.valid.sum() / len(batch))
 
 
 @torch.no_grad()

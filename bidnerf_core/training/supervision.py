@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
-from bidnerf_core.fields import RadianceField, Rendering, SceneBounds, render
+from bidnerf_core.fields import RadianceField, Rendering, SceneBounds, levels, render
 from bidnerf_core.frames import View
 from bidnerf_core.settings import NotNegative, Settings
 from bidnerf_core.training.loop import Replayable, Report, StepOutcome, cosine, fit
@@ -69,11 +69,15 @@ class Supervision:
         fit(field, [*groups, *learned], outcome, steps, report, schedule, seed, beside=self.colours)
 
     def step(self, field: RadianceField, count: int, generator: Generator) -> StepOutcome:
-        """Render ``count`` rays drawn from the views, and return their loss."""
+        """Render ``count`` rays drawn from the views with every level of the field, and return the sum of their losses.
+
+        The colour error and the number of samples are those of the finest level.
+        """
         batch = self.draw(count, generator)
-        rendering = render(field, batch.rays, batch.background, generator)
-        loss, mse = self.loss(rendering, batch)
-        return StepOutcome(loss, mse, rendering.samples.valid.sum() / len(batch))
+        renderings = [render(level, batch.rays, batch.background, generator) for level in levels(field)]
+        losses, errors = zip(*(self.loss(rendering, batch) for rendering in renderings), strict=True)
+        samples = renderings[-1].samples.valid.sum() / len(batch)
+        return StepOutcome(torch.stack(losses).sum(), errors[-1], samples)
 
     def draw(self, count: int, generator: Generator) -> TrainingBatch:
         """Return a batch of ``count`` rays; see ``RayBank.draw``."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
@@ -22,12 +21,10 @@ from bidnerf_core.fields import (
     octaves,
     render,
 )
-from bidnerf_core.frames import View
 from bidnerf_core.training import RayBank, Supervision, ray_termination, supervised_loss
 from bidnerf_vanilla import VanillaConfig, VanillaField, backend
 from bidnerf_vanilla.field import OccupiedOnly
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig
-from bidnerf_vanilla.recipe import step_outcome
 from simulated_device import StaysOnDevice
 
 SMALL = VanillaConfig(
@@ -119,11 +116,6 @@ def test_an_untrained_field_is_nearly_transparent() -> None:
 # Hierarchical sampling.
 
 
-def inner(sampler: RaySampler) -> RaySampler:
-    assert isinstance(sampler, OccupiedOnly)
-    return sampler.sampler
-
-
 def test_more_samples_go_near_the_surface() -> None:
     """The coarse network is a wall at x = 0: most of the samples that the fine level adds are at its front."""
     field = built(coarse_samples=32, fine_samples=32, position_frequencies=0).double()
@@ -158,16 +150,13 @@ def test_no_gradient_flows_through_the_choice_of_place() -> None:
 # Room for matter.
 
 
-def carve(field: VanillaField, views: Sequence[View]) -> None:
-    field.room.cells.copy_(occupied_voxels(views, field.room.grid))
-
-
 def test_no_point_is_queried_outside_the_room() -> None:
     field = built()
-    carve(field, rgbd_views())
+    field.room.cells.copy_(occupied_voxels(rgbd_views(), field.room.grid))
     rays = rays_of_view()
     for level in levels(field):
-        everywhere, found = inner(level.sampler)(rays), level.sampler(rays)
+        assert isinstance(level.sampler, OccupiedOnly)
+        everywhere, found = level.sampler.sampler(rays), level.sampler(rays)
         assert torch.equal(found.starts, everywhere.starts)
         held = field.room.holds(rays.at(found.middles))
         assert torch.equal(found.valid, everywhere.valid & held)
@@ -199,7 +188,7 @@ def test_both_levels_learn_from_a_step() -> None:
     field = built()
     generator = torch.Generator().manual_seed(0)
     supervision = Supervision(rgbd_views(), BOUNDS, SMALL)
-    outcome = step_outcome(field, supervision, supervision.draw(64, generator), generator)
+    outcome = supervision.step(field, 64, generator)
     outcome.loss.backward()
     assert all(float(p.grad.abs().sum()) > 0 for p in field.parameters() if p.grad is not None)
     assert all(p.grad is not None for p in field.parameters())

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import torch
 from torch import Generator, Tensor
 
-from bidnerf_core.fields import device_of, render
+from bidnerf_core.fields import device_of
 from bidnerf_core.frames import View
 from bidnerf_core.settings import Count, NotNegative, Positive, Range
 from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig, cosine
@@ -62,11 +62,8 @@ def train(field: GaussiansField, views: Sequence[View], config: GaussiansConfig,
             field.refit()
         elif step % config.refit_every == 0 or step == config.steps - 1:
             field.refit()
-        batch = supervision.draw(config.rays_per_step, generator)
-        rendering = render(field, batch.rays, batch.background, generator)
-        loss, mse = supervision.loss(rendering, batch)
-        loss = loss + config.opacity_weight * field.logits.sigmoid().mean()
-        return StepOutcome(loss, mse, float(rendering.samples.valid.sum() / len(batch)))
+        rendered = supervision.step(field, config.rays_per_step, generator)
+        return replace(rendered, loss=rendered.loss + config.opacity_weight * field.logits.sigmoid().mean())
 
     supervision.fit(field, _groups(field, config, unit), outcome, config.steps, report, cosine, config.seed)
 

@@ -10,7 +10,7 @@ from typing import Annotated
 from torch import Generator
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields import device_of, render
+from bidnerf_core.fields import device_of
 from bidnerf_core.frames import View
 from bidnerf_core.settings import Count, NotNegative, Range
 from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig
@@ -43,11 +43,7 @@ def train(field: NerfPytorchField, views: Sequence[View], config: NerfPytorchCon
     supervision = Supervision(views, field.bounds, config, device_of(field))
 
     def outcome(step: int, generator: Generator) -> StepOutcome:
-        batch = supervision.draw(config.rays_per_step, generator)
-        coarse, fine = (render(level, batch.rays, batch.background, generator) for level in field.levels)
-        rough, _ = supervision.loss(coarse, batch)
-        loss, mse = supervision.loss(fine, batch)
-        return StepOutcome(rough + loss, mse, float(fine.samples.valid.sum() / len(batch)))
+        return supervision.step(field, config.rays_per_step, generator)
 
     groups = [{"params": list(field.parameters()), "lr": config.learning_rate}]
     supervision.fit(field, groups, outcome, config.steps, report, seed=config.seed)

@@ -24,7 +24,6 @@ from bidnerf_core.fields import (
     device_of,
     encoding_width,
     frequency_encoding,
-    render,
 )
 from bidnerf_core.frames import View
 from bidnerf_core.settings import Count, Layers, Positive, Range
@@ -140,11 +139,7 @@ def train(field: VanillaField, views: Sequence[View], config: VanillaConfig, rep
     supervision = Supervision(views, field.bounds, config, device_of(field))
 
     def outcome(step: int, generator: Generator) -> StepOutcome:
-        batch = supervision.draw(config.rays_per_step, generator)
-        coarse, fine = (render(level, batch.rays, batch.background, generator) for level in field.levels)
-        rough, _ = supervision.loss(coarse, batch)
-        loss, mse = supervision.loss(fine, batch)
-        return StepOutcome(rough + loss, mse, float(fine.samples.valid.sum() / len(batch)))
+        return supervision.step(field, config.rays_per_step, generator)
 
     groups = [{"params": list(field.parameters()), "lr": config.learning_rate}]
     supervision.fit(field, groups, outcome, config.steps, report, seed=config.seed)

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.fields import SceneBounds, device_of, render
+from bidnerf_core.fields import SceneBounds, device_of
 from bidnerf_core.frames import View, draw, uniform
 from bidnerf_core.settings import Count, NotNegative, Range
 from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig, cosine
@@ -51,10 +51,7 @@ def train(field: ScanField, views: Sequence[View], config: ScanConfig, report: R
         field.assign(first_pieces(field, views, Generator().manual_seed(config.seed)))
 
     def outcome(step: int, generator: Generator) -> StepOutcome:
-        batch = supervision.draw(config.rays_per_step, generator)
-        rendering = render(field, batch.rays, batch.background, generator)
-        loss, mse = supervision.loss(rendering, batch)
-        return StepOutcome(loss, mse, float(rendering.samples.valid.sum() / len(batch)))
+        return supervision.step(field, config.rays_per_step, generator)
 
     groups = [
         {"params": [field.logits], "lr": config.opacity_rate},
