@@ -3,9 +3,8 @@
     BIDNERF_DATA=... python tests/robustness/mutations.py [--tests ROOT] [--seconds 150] [--out out/mutations.json]
 
 ROOT is the checkout whose code and tests are measured, by default that of this script. ``mutations.json`` lists the faults,
-so that two versions of the suite are measured by the same ones. A fault is identified by its file, its function and the
-text of the expression, not by its line; one that no longer applies is reported and not counted. Without the list, a new
-one is drawn with a fixed seed: delete it to draw again.
+so that two versions of the suite are measured by the same ones. A fault is identified by its file and the text of its
+expression, not by its line; one that no longer applies is reported and not counted.
 
 Tests run first on the sound code, which records which functions they enter and the CPU time. With a fault, the
 files that enter its function run until a test fails, for up to ``--seconds`` of CPU: first those whose text names most of
@@ -21,7 +20,6 @@ import ast
 import compileall
 import json
 import os
-import random
 import re
 import resource
 import shutil
@@ -29,9 +27,8 @@ import signal
 import sys
 import threading
 import time
-from collections import Counter, defaultdict
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from collections import defaultdict
+from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -39,34 +36,6 @@ from types import CodeType, FrameType
 from typing import IO, Any, NoReturn
 
 FAULTS = Path(__file__).with_suffix(".json")
-SEED = 2024
-STRATA = (
-    (28, "localization mapping camera geometry fields depth carving training captures frames structure"),
-    (12, "datasets io maps results evaluation service viewer cli"),
-)
-"""How many faults are drawn from which packages: the numerical ones, and those around them."""
-OPERATORS = {ast.Add: "+-", ast.Sub: "-+", ast.Mult: "*/", ast.Div: "/*"}
-BOUNDS = {ast.Lt: ("<", "<="), ast.LtE: ("<=", "<"), ast.Gt: (">", ">="), ast.GtE: (">=", ">")}
-EXTREMES = {"min": "max", "amin": "amax", "argmin": "argmax", "minimum": "maximum", "clamp_min": "clamp_max"}
-EXTREMES |= {most: least for least, most in EXTREMES.items()}
-AXES = {"0": "1", "1": "0", "-1": "-2", "-2": "-1"}
-SKIPPED = ast.Import | ast.ImportFrom | ast.Raise | ast.Assert | ast.JoinedStr | ast.arguments
-SKIPPED_FIELDS = {"annotation", "returns", "decorator_list"}
-MESSAGES = re.compile(r"(.*\.)?(print|warn|\w*(Error|Warning)|debug|info|log_message)")
-"""Functions whose arguments are only shown."""
-DISPLAYS = ast.List | ast.Tuple | ast.Dict | ast.Set | ast.ListComp | ast.JoinedStr
-NO_NUMBERS = re.compile(
-    r"""b?["'].*|(str|bytes|list|tuple|set|sorted|Path)\(.*|.*(keys|encode|read_bytes|perf_counter)\(.*"""
-    r"""|.*(path|folder|file|root|directory|parent|name|text|dir|base|content|word|line)s?(\[.*)?""",
-    re.IGNORECASE | re.DOTALL,
-)
-"""Operands that are joined or repeated rather than added, divided or multiplied, and times that are only shown."""
-TINY = re.compile(r"\de-[5-9]|\de-\d\d|\b(EPS|EPSILON|TINY|ROUNDING)\b")
-"""Summands that guard against division by zero: without them, results are equal."""
-COUNT = re.compile(r"\d+|len\(.*|.*(\.ndim|\.numel\(\)|\.shape\[\S+\]|\.sum\(\)|count)")
-"""A side of a comparison that makes equality likely."""
-CONTEXT = 20
-"""Letters of an expression that identify it in its function, unless the whole of it is shorter."""
 LONGEST = 1800.0
 """Seconds for the tests of a file on the sound code."""
 MOST_PAGES = 6 * 2**30 // 4096
@@ -88,112 +57,18 @@ class Fault:
     kind: str
     text: str  # of the expression, which ``becomes`` replaces
     becomes: str
-    nth: int = 0  # among the same in the function, from 0
+    nth: int = 0  # among the same expressions in the file, from 0
 
 
-def candidates(root: Path, path: Path) -> Iterator[tuple[Fault, bytes]]:
-    """Yield all faults that can be made in a file, each with the changed file."""
-    source = path.read_bytes().decode("latin-1")  # a letter a byte, in which ``ast`` counts
-    lines = [0, *(match.end() for match in re.finditer("\n", source))]
-    seen: Counter[Fault] = Counter()
-
-    def span(node: Any) -> tuple[int, int]:
-        return lines[node.lineno - 1] + node.col_offset, lines[node.end_lineno - 1] + node.end_col_offset
-
-    def text(node: ast.AST) -> str:
-        return source[slice(*span(node))]
-
-    def joined(node: ast.AST) -> bool:
-        if isinstance(node, ast.BinOp):
-            return joined(node.left) or joined(node.right)
-        return isinstance(node, DISPLAYS) or NO_NUMBERS.fullmatch(text(node)) is not None
-
-    def operator(left: ast.AST, right: ast.AST, old: str, new: str) -> tuple[int, int, str]:
-        at = source.index(old, span(left)[1], span(right)[0])
-        return at, at + len(old), new
-
-    def changes(node: Any) -> Iterator[tuple[str, tuple[int, int, str]]]:
-        """Yield the kinds of faults at a node, each with the part of the source and its replacement."""
-        start, end = span(node) if hasattr(node, "lineno") else (0, 0)
-        match node:
-            case ast.BinOp(left=left, right=right) | ast.AugAssign(target=left, value=right):
-                if type(node.op) in OPERATORS and not joined(left) and not joined(right):
-                    at, stop, new = operator(left, right, *OPERATORS[type(node.op)])
-                    yield "sign" if new in "+-" else "scale", (at, stop, new)
-                    if new in "+-" and isinstance(node, ast.BinOp) and not TINY.search(text(right)):
-                        yield "dropped summand", (len(source[:at].rstrip()), end, "")
-            case ast.UnaryOp(op=ast.USub()) if not source.endswith(("dim=", "axis="), 0, start):
-                yield "dropped minus", (start, start + 1, "")
-            case ast.Compare(left=left, ops=[op], comparators=[right]) if type(op) in BOUNDS:
-                if COUNT.fullmatch(text(left)) or COUNT.fullmatch(text(right)):
-                    yield "boundary", operator(left, right, *BOUNDS[type(op)])
-            case ast.BoolOp(op=op, values=[left, right]):
-                words = ("and", "or") if isinstance(op, ast.And) else ("or", "and")
-                at, stop, new = operator(left, right, *words)
-                yield "connective", (start, end, f"({source[start:at]}{new}{source[stop:end]})")
-            case ast.If(test=test) | ast.While(test=test) | ast.IfExp(test=test):
-                yield "negated condition", (*span(test), f"not ({text(test)})")
-            case ast.Slice() | ast.Call(func=ast.Name(id="range") | ast.Attribute(attr="arange")):
-                for bound in node.args if isinstance(node, ast.Call) else (node.lower, node.upper):
-                    number = bound.operand if isinstance(bound, ast.UnaryOp) else bound
-                    if isinstance(number, ast.Constant) and type(number.value) is int:
-                        for step in (1, -1):
-                            yield "off by one", (*span(number), str(number.value + step))
-            case ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name)) if name in EXTREMES:
-                stop = span(node.func)[1]
-                yield "extreme", (stop - len(name), stop, EXTREMES[name])
-            case ast.keyword(arg="dim" | "axis", value=axis) if text(axis) in AXES:
-                yield "axes", (*span(axis), AXES[text(axis)])
-            case ast.Subscript(slice=ast.Tuple(elts=[first, *_, ast.Constant() as axis])):
-                if text(axis) in AXES and (isinstance(first, ast.Slice) or text(first) == "..."):
-                    yield "axes", (*span(axis), AXES[text(axis)])
-            case ast.Attribute(attr="T" | "mT" as name) if not source.startswith(".", end):  # a pose's has more
-                yield "axes", (end - len(name) - 1, end, "")
-
-    def walk(node: Any, name: str, inside: bool, around: list[ast.AST]) -> Iterator[tuple[Fault, bytes]]:
-        if isinstance(node, ast.Call) and MESSAGES.fullmatch(text(node.func)):
-            return
-        if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-            name = f"{name}{'.<locals>' * inside}{'.' * bool(name)}{node.name}"
-            inside = not isinstance(node, ast.ClassDef)
-        if isinstance(node, ast.expr | ast.stmt):
-            around = [*around, node] if isinstance(node, ast.expr) else []
-        refuses = isinstance(node, ast.If) and isinstance(node.body[0], ast.Raise)
-        for kind, (start, end, new) in changes(node) if inside and not refuses else ():
-            # A statement of several lines is not known by its text, but by that of its condition.
-            whole = [*reversed(around)] or [node if isinstance(node, ast.AugAssign) else node.test]
-            first, last = span(next((outer for outer in whole if len(text(outer)) >= CONTEXT), whole[-1]))
-            texts = source[first:last], source[first:start] + new + source[end:last]
-            before, after = (" ".join(code.split()) for code in texts)
-            fault = Fault(str(path.relative_to(root)), name, kind, before, after)
-            changed = source[:start] + new + source[end:]
-            yield replace(fault, nth=seen[fault]), changed.encode("latin-1")
-            seen[fault] += 1
-        for field, value in ast.iter_fields(node):
-            if field not in SKIPPED_FIELDS and not (refuses and field == "test"):
-                for child in value if isinstance(value, list) else [value]:
-                    if isinstance(child, ast.AST) and not isinstance(child, SKIPPED):
-                        yield from walk(child, name, inside, around)
-
-    yield from walk(ast.parse(path.read_bytes()), "", False, [])
-
-
-def draw(root: Path) -> list[Fault]:
-    """Draw as many faults of each kind as of the others, and at most one of a file."""
-    drawn: list[Fault] = []
-    chance = random.Random(SEED)
-    for count, packages in STRATA:
-        pool: dict[str, list[Fault]] = defaultdict(list)
-        for package in packages.split():
-            for path in sorted(root.glob(f"bidnerf*/{package}/**/*.py")):
-                for fault, _ in candidates(root, path):
-                    pool[fault.kind].append(fault)
-        kinds = chance.sample(sorted(pool), len(pool))
-        for number in range(count):
-            files = {fault.file for fault in drawn}
-            of_kind = [fault for fault in pool[kinds[number % len(kinds)]] if fault.file not in files]
-            drawn.append(chance.choice(of_kind))
-    return drawn
+def with_fault(root: Path, fault: Fault) -> str | None:
+    """Return the source of a fault's file with the fault, or None if its expression is no longer there."""
+    path = root / fault.file
+    source = path.read_text(encoding="utf-8") if path.exists() else ""
+    spelled = list(re.finditer(r"\s+".join(map(re.escape, fault.text.split())), source))
+    if len(spelled) <= fault.nth:
+        return None
+    start, end = spelled[fault.nth].span()
+    return source[:start] + fault.becomes + source[end:]
 
 
 def run_tests(copy: Path, test: str, slow: bool, sound: Row | None = None) -> Row:
@@ -305,7 +180,7 @@ class Measurement:
         # Those first that enter little and are fast.
         units.sort(key=lambda unit: sound[unit]["seconds"] * len(sound[unit]["entered"]))
         original, times = path.read_bytes(), path.stat()
-        path.write_bytes(dict(candidates(self.copy, path))[fault])
+        path.write_text(with_fault(self.copy, fault) or "", encoding="utf-8")
         for unit in units:
             spent = sum(run["seconds"] for run in done.values()) + sound[unit]["seconds"]
             if unit not in done and spent <= seconds and not self.caught(number):
@@ -335,9 +210,6 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=150)
     parser.add_argument("--out", type=Path, default=Path("out/mutations.json"), metavar="FILE")
     arguments = parser.parse_args()
-    if not FAULTS.exists():
-        drawn = [asdict(fault) for fault in draw(arguments.tests)]
-        FAULTS.write_text(json.dumps(drawn, indent=1) + "\n")
     faults = [Fault(**fields) for fields in json.loads(FAULTS.read_text())]
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     with arguments.out.with_suffix(".rows.jsonl").open("a+") as rows, TemporaryDirectory() as folder:
@@ -349,11 +221,7 @@ def main() -> None:
         for library in ("cv2", "hypothesis", "kornia", "pytest", "scipy.optimize"):
             import_module(library)
         measurement = Measurement(arguments.tests, copy, rows)
-        applies = {
-            number: fault
-            for number, fault in enumerate(faults)
-            if (copy / fault.file).exists() and fault in dict(candidates(copy, copy / fault.file))
-        }
+        applies = {number: fault for number, fault in enumerate(faults) if with_fault(copy, fault)}
         for number, fault in applies.items():
             for unit in measurement.mentioning(fault):
                 if not measurement.caught(number):
