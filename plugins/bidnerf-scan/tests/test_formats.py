@@ -91,11 +91,7 @@ def test_a_gltf_is_placed_by_its_nodes(tmp_path: Path) -> None:
 
 def ply_of(points: np.ndarray, rgb: np.ndarray | None, text: bool) -> bytes:
     kind = [(axis, "<f4") for axis in "xyz"] + ([] if rgb is None else [(c, "u1") for c in "rgb"])
-    rows = np.zeros(len(points), kind)
-    for number, axis in enumerate("xyz"):
-        rows[axis] = points[:, number]
-    for number, c in enumerate("rgb" if rgb is not None else ""):
-        rows[c] = rgb[:, number]
+    rows = np.rec.fromarrays([*points.T, *([] if rgb is None else rgb.T)], dtype=np.dtype(kind))
     names = {"r": "red", "g": "green", "b": "blue"}
     lines = [
         "ply",
@@ -126,10 +122,8 @@ def lzf_of(data: bytes) -> bytes:
 
 def pcd_of(points: np.ndarray, rgb: np.ndarray, data: str) -> bytes:
     packed = (rgb.astype(np.uint32) << [16, 8, 0]).sum(-1).astype(np.uint32)
-    rows = np.zeros(len(points), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<f4")])
-    for number, axis in enumerate("xyz"):
-        rows[axis] = points[:, number]
-    rows["rgb"] = packed.view(np.float32)
+    kind = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<f4")]
+    rows = np.rec.fromarrays([*points.T, packed.view(np.float32)], dtype=np.dtype(kind))
     head = (
         "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
         f"WIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA {data}\n"
