@@ -73,20 +73,6 @@ def hit(rays: Rays) -> Tensor:
 # Bins.
 
 
-@pytest.mark.parametrize("jitter", [False, True])
-def test_bins_tile_the_way_through_the_box(rays: Rays, generator: Generator, jitter: bool) -> None:
-    samples = Bins(BOUNDS, 16)(rays, generator if jitter else None)
-    met = hit(rays)
-    assert bool(samples.valid[met].all())
-    assert not bool(samples.valid[~met].any())
-    torch.testing.assert_close(samples.starts[met][:, 0], rays.near[met])
-    torch.testing.assert_close(samples.ends[met][:, -1], rays.far[met])
-    torch.testing.assert_close(samples.ends[met][:, :-1], samples.starts[met][:, 1:])
-    if not jitter:
-        width = (rays.far - rays.near)[:, None].expand(-1, 16) / 16
-        torch.testing.assert_close((samples.ends - samples.starts)[met], width[met], atol=1e-5, rtol=0)
-
-
 def test_bins_do_not_move_with_the_limits_of_a_ray(rays: Rays) -> None:
     whole = Bins(BOUNDS, 16)(rays)
     wide = Bins(BOUNDS, 16)(replace(rays, near=0 * rays.near, far=2 * rays.far))
@@ -207,13 +193,18 @@ def lessons(rays: Rays) -> tuple[RaySamples, TrainingBatch]:
     return samples, black_batch(rays, samples.middles[:, 5])
 
 
+def slopes(samples: RaySamples, weights: Tensor, batch: TrainingBatch) -> Tensor:
+    """Return the gradient of the oracle's loss by its logits, where all are zero."""
+    logits = torch.zeros_like(samples.starts, requires_grad=True)
+    oracle_loss(logits, samples, weights, batch).backward()
+    return require(logits.grad)
+
+
 def test_measured_depth_teaches_the_oracle(lessons: tuple[RaySamples, TrainingBatch]) -> None:
     samples, batch = lessons
-    logits = torch.zeros_like(samples.starts, requires_grad=True)
-    oracle_loss(logits, samples, torch.zeros_like(logits), batch).backward()
-    assert logits.grad is not None
-    assert bool((logits.grad[:, 5] < 0).all())  # the score is to rise at the surface
-    assert bool((logits.grad[:, [0, 1, 2, 8, 9, 15]] > 0).all())  # and to fall elsewhere
+    slope = slopes(samples, torch.zeros_like(samples.starts), batch)
+    assert bool((slope[:, 5] < 0).all())  # the score is to rise at the surface
+    assert bool((slope[:, [0, 1, 2, 8, 9, 15]] > 0).all())  # and to fall elsewhere
     unmeasured = black_batch(batch.rays, torch.zeros(len(batch)))
     assert float(by_depth(samples, unmeasured).max()) == 0
     torch.testing.assert_close(by_depth(samples, batch)[:, 5], torch.ones(len(samples.starts)))
@@ -222,15 +213,12 @@ def test_measured_depth_teaches_the_oracle(lessons: tuple[RaySamples, TrainingBa
 def test_shaded_bins_teach_the_oracle_without_depth(lessons: tuple[RaySamples, TrainingBatch]) -> None:
     samples, batch = lessons
     unmeasured = black_batch(batch.rays, torch.zeros(len(batch)))
-    logits = torch.zeros_like(samples.starts, requires_grad=True)
-    weights = torch.zeros_like(logits)
+    weights = torch.zeros_like(samples.starts)
     weights[:, 9] = 0.9
-    weights.requires_grad_()
-    oracle_loss(logits, samples, weights, unmeasured).backward()
-    assert logits.grad is not None
+    slope = slopes(samples, weights.requires_grad_(), unmeasured)
     assert weights.grad is None  # the shading network is the teacher
-    assert bool((logits.grad[:, 9] < 0).all())
-    assert bool((logits.grad[:, :8] > 0).all() and (logits.grad[:, 11:] > 0).all())
+    assert bool((slope[:, 9] < 0).all())
+    assert bool((slope[:, :8] > 0).all() and (slope[:, 11:] > 0).all())
 
 
 def test_a_bin_matters_more_the_more_weight_it_has() -> None:
@@ -245,11 +233,9 @@ def test_a_bin_matters_more_the_more_weight_it_has() -> None:
 
 def test_rays_that_miss_the_scene_teach_nothing(rays: Rays) -> None:
     samples, batch = Bins(BOUNDS, 16)(rays), black_batch(rays, torch.zeros_like(rays.near))
-    logits = torch.ones_like(samples.starts, requires_grad=True)
-    oracle_loss(logits, samples, torch.zeros_like(logits), batch).backward()
-    assert logits.grad is not None
-    assert float(logits.grad[~hit(rays)].abs().max()) == 0
-    assert float(logits.grad[hit(rays)].abs().min()) > 0
+    slope = slopes(samples, torch.zeros_like(samples.starts), batch)
+    assert float(slope[~hit(rays)].abs().max()) == 0
+    assert float(slope[hit(rays)].abs().min()) > 0
 
 
 # Phases.

@@ -13,7 +13,6 @@ from bidnerf.testing import SIDE, BackendContract, Recorder, rgbd_views
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import (
-    RaySampler,
     RaySamples,
     encoding_width,
     frequency_encoding,

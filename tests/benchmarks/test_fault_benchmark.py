@@ -16,6 +16,7 @@ from scipy.stats import chi2
 import tiny
 from bidnerf.evaluation import FAULTS, NO_FAULT
 from bidnerf_core.registry import registered
+from localizations import answer_row
 
 
 @pytest.fixture
@@ -23,15 +24,8 @@ def faults(script: Callable[[str], ModuleType]) -> ModuleType:
     return script("faults")
 
 
-def row(right: bool, converged: bool, squared: float | None = None) -> dict[str, Any]:
-    error = 0.01 if right else 1.0
-    return {
-        "translation": error,
-        "rotation_deg": error,
-        "converged": converged,
-        "normalized_error_squared": squared,
-        "cpu_seconds": 2.0,
-    }
+def row(right: bool, converged: bool, squared: float | None = None) -> Any:
+    return answer_row(0.01 if right else 1.0, converged, squared, cpu_seconds=2.0)
 
 
 def test_a_cell_counts_silent_and_rejected_answers(faults: ModuleType) -> None:

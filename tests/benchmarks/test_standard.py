@@ -7,16 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
-import imageio.v3 as iio
 import pytest
 import torch
 
 from bidnerf import SE3, Intrinsics, View
-from bidnerf.results import as_picture
 from bidnerf.scenes import demo_object, orbit, views
 from bidnerf_core.errors import InputError
 from localizations import answer_row
-from scan_layouts import write_frames, write_twelve_scenes
+from scan_layouts import write_cambridge, write_frames, write_twelve_scenes
 
 Script = Callable[[str], ModuleType]
 CAMERA, SFM_FOCAL = Intrinsics(32.0, 32.0, 16.0, 12.0, 32, 24), 33.0
@@ -39,19 +37,7 @@ def publish(folder: Path, layout: str, train: list[View], test: list[View]) -> P
     """Write a scene as the authors of a benchmark do, with the poses of structure from motion beside it."""
     scene, sfm, rows = folder / "apt1" / "kitchen", folder / "sfm", dict[str, list[str]]()
     if layout == "Cambridge":
-        cameras = []
-        for split, some in (("train", train), ("test", test)):
-            listed = ["Visual Landmark Dataset V1", "ImageFile, Camera Position [X Y Z W P Q R]", ""]
-            for number, view in enumerate(some):
-                name, T = f"seq_{split}/frame{number:05}", view.T_ref_camera.to(dtype=torch.float64)
-                (scene / name).parent.mkdir(parents=True, exist_ok=True)
-                iio.imwrite(scene / f"{name}.png", as_picture(view.frame.rgb))
-                centre = " ".join(map(str, T.translation.tolist()))
-                listed.append(f"{name}.png {centre} {quaternion(T.inverse())}")
-                cameras.append(f"{name}.jpg\t{CAMERA.fx} {quaternion(T.inverse())} {centre} 0.01 0")
-            (scene / f"dataset_{split}.txt").write_text("\n".join(listed))
-        (scene / "reconstruction.nvm").write_text("\n".join(["NVM_V3", "", f"{len(cameras)}", *cameras]))
-        return scene
+        return write_cambridge(scene, [test[0], *train, *test[1:]])
     seven, every = layout == "7-Scenes", [*test, *train]  # the first sequence is the test split
     if seven:
         write_frames(scene / "seq-01", test, "png")
@@ -80,7 +66,7 @@ def publish(folder: Path, layout: str, train: list[View], test: list[View]) -> P
 
 @pytest.mark.parametrize("layout", ["7-Scenes", "12-Scenes", "Cambridge"])
 def test_a_scene_is_read_as_published(standard: ModuleType, tmp_path: Path, layout: str) -> None:
-    train, test = render_views(4), render_views(2, seed=1)
+    train, test = render_views(7), render_views(2, seed=1)
     folder = publish(tmp_path, layout, train, test)
     assert standard.benchmark_of(folder) == layout
     found = standard.ground_truths(folder, tmp_path / "sfm")

@@ -167,8 +167,10 @@ def test_a_far_and_large_world_is_the_same_world() -> None:
 
 def in_other_units(view: View, scale: float, shift: Float[Tensor, "3"]) -> View:
     pose = SE3(view.T_ref_camera.rotation, view.T_ref_camera.translation * scale + shift)
-    depth = view.frame.depth
-    return View(replace(view.frame, depth=None if depth is None else depth * scale), pose)
+    depth, seen = view.frame.depth, view.landmarks
+    if seen is not None:
+        seen = replace(seen, distance=scale * seen.distance, deviation=scale * seen.deviation)
+    return View(view.frame.replace(depth=None if depth is None else depth * scale), pose, landmarks=seen)
 
 
 def test_large_images_are_shrunk_and_still_safe() -> None:
@@ -245,9 +247,8 @@ def test_wild_measurements_do_not_move_the_box() -> None:
     views = ball_views(alpha=False)
     calm = estimate_bounds(views)
     for view in views:
-        assert view.frame.depth is not None
-        view.frame.depth[0, 0] = 1000.0  # one of some 400 measured pixels of a view
-        view.frame.depth[0, 1] = 1e-4
+        # Of some 400 measured pixels of a view, one each.
+        require(view.frame.depth)[0, :2] = torch.tensor([1000.0, 1e-4])
     wild = estimate_bounds(views)
     assert max(wild.size) < 2000  # one in 400 is more than may be wild: the box tells of it ...
     for view in views[1:]:

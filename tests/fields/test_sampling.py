@@ -12,6 +12,7 @@ from torch import Generator
 from balls import HomogeneousBall
 from bidnerf.scenes import GaussianBlobs
 from bidnerf.testing import check_background, check_intervals, check_rays_alone, check_repeatable
+from bidnerf_adanerf.bins import Bins
 from bidnerf_core.fields import (
     FieldValues,
     Importance,
@@ -87,14 +88,18 @@ def test_the_contracts_laws_hold(name: str, made: Callable[[RaySampler], RaySamp
 
 
 @pytest.mark.parametrize("jittered", [False, True])
-def test_stratified_intervals_tile_the_ray(jittered: bool) -> None:
+@pytest.mark.parametrize("sampler", [Stratified(16), Bins(BOUNDS, 16)], ids=["stratified", "bins"])
+def test_contiguous_intervals_tile_the_ray(sampler: RaySampler, jittered: bool) -> None:
     where = rays(50)
     hits = where.far > where.near
-    samples = Stratified(16)(where, Generator().manual_seed(0) if jittered else None)
+    samples = sampler(where, Generator().manual_seed(0) if jittered else None)
     assert torch.equal(samples.valid, hits[:, None].expand(50, 16))
-    assert torch.equal(samples.starts[:, 1:], samples.ends[:, :-1])
-    torch.testing.assert_close(samples.starts[:, 0], where.near)
-    torch.testing.assert_close(samples.ends[:, -1], where.far)
+    torch.testing.assert_close(samples.starts[hits][:, 1:], samples.ends[hits][:, :-1])
+    torch.testing.assert_close(samples.starts[hits][:, 0], where.near[hits])
+    torch.testing.assert_close(samples.ends[hits][:, -1], where.far[hits])
+    if not jittered:
+        width = (where.far - where.near)[:, None].expand(-1, 16) / 16
+        torch.testing.assert_close((samples.ends - samples.starts)[hits], width[hits], atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("jittered", [False, True])

@@ -17,14 +17,10 @@ BOUNDS = SceneBounds((-1.2, -0.4, 0.1), (0.8, 0.7, 1.3), 0.1, 8.0)
 GRID = VoxelGrid((-1.2, -0.4, 0.1), 0.17, (12, 7, 8))
 
 
-def numbered(grid: VoxelGrid) -> torch.Tensor:
-    return torch.arange(math.prod(grid.shape)).reshape(grid.shape)
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_cell_s_centre_is_in_that_cell(dtype: torch.dtype) -> None:
     centres = cell_centres(GRID).to(dtype)
-    assert torch.equal(GRID.numbers(centres), numbered(GRID))
+    assert torch.equal(GRID.numbers(centres), torch.arange(math.prod(GRID.shape)).reshape(GRID.shape))
     assert bool(GRID.contains(centres).all())
 
 

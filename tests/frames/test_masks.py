@@ -50,11 +50,6 @@ def saved(path: Path, mask: np.ndarray) -> Path:
     return path
 
 
-def covering(white: np.ndarray) -> np.ndarray:
-    """The mask as the alpha channel of an image of one colour."""
-    return np.dstack([np.full((*white.shape, 3), 200, np.uint8), white])
-
-
 @pytest.mark.parametrize(
     "stored",
     [
@@ -63,7 +58,7 @@ def covering(white: np.ndarray) -> np.ndarray:
         left() == 255,
         left().astype(np.uint16) * 257,
         np.dstack([left()] * 3),
-        covering(left()),
+        np.dstack([np.full((*SIZE[::-1], 3), 200, np.uint8), left()]),  # as the alpha channel of one colour
         left(24, 16),
         left(6 * 4, 4 * 4),
     ],
@@ -184,10 +179,9 @@ def test_masks_of_turned_photos_serve_sequences_as_they_serve_photos(
     path = saved(tmp_path / "masks" / "p.png", mask)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
-        alone = Frame.open(photo, focal=10.0, mask=path).hidden
+        alone = require(Frame.open(photo, focal=10.0, mask=path).hidden)
         (timed,) = open_sequence(tmp_path / "photos", focal=10.0, masks=tmp_path / "masks")
         upright = Frame.open(photo, focal=10.0).rgb.shape[:2]
-    assert alone is not None
     assert torch.equal(alone, Orientation.from_exif(code).upright(torch.from_numpy(mask == 0)))
     assert torch.equal(require(timed.frame.hidden), alone)
     assert alone.shape == upright

@@ -14,14 +14,12 @@ import torch
 from bidnerf import Frame, Intrinsics, Localizer
 from bidnerf.evaluation import faulty
 from bidnerf.results import pose_error
-from bidnerf.testing import BOUNDS, GROUND_CAMERA, textured_map, unseen
+from bidnerf.testing import GROUND_CAMERA, textured_map, unseen
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.geometry import SE3
-from bidnerf_core.mapping import LandmarkMap
-from bidnerf_core.maps import Map, MapInfo
 from commands import Run
 from optional import require
-from stored_ground import open_map
+from stored_ground import landmarks_of, open_ground
 
 
 @pytest.fixture
@@ -31,21 +29,13 @@ def photo(tmp_path: Path) -> Path:
     return path
 
 
-def stored(monkeypatch: pytest.MonkeyPatch, landmarks: LandmarkMap | None) -> None:
-    """Let the command load the textured ground with these landmarks, whatever the folder."""
-    known, info = textured_map(surface=True), MapInfo("ground", {}, BOUNDS, 1, True, "data", weights="ground")
-    open_map(monkeypatch, Map(info, known.field, known.surface, landmarks))
-
-
-def landmarks_of(*cameras: Intrinsics) -> LandmarkMap:
-    found = require(textured_map().landmarks)
-    scatter = torch.full((4,), 0.001, dtype=torch.float64)  # as if trial photos had been localized in the map
-    return replace(found, cameras=cameras, calibration_scatter=scatter)
+def longer(factor: float) -> Intrinsics:
+    return replace(GROUND_CAMERA, fx=GROUND_CAMERA.fx * factor, fy=GROUND_CAMERA.fy * factor)
 
 
 @pytest.mark.slow
 def test_the_command_finds_the_pose(bidnerf: Run, photo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stored(monkeypatch, landmarks_of(GROUND_CAMERA))
+    open_ground(monkeypatch, assumed=(GROUND_CAMERA,))
     _, out, err = bidnerf("localize", "MAP", photo, "--json").succeed()
     answer = json.loads(out)
     assert answer["converged"]
@@ -55,32 +45,30 @@ def test_the_command_finds_the_pose(bidnerf: Run, photo: Path, monkeypatch: pyte
     assert "camera unknown, assumed to be that of the map's images" in err
 
 
-@pytest.mark.parametrize("option", [["--no-landmarks"], ["--method", "inerf", "--start", "start.json"]])
-def test_methods_that_do_not_estimate_a_focal_length_need_one(
-    bidnerf: Run, photo: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, option: list[str]
+@pytest.mark.parametrize(
+    ("has_landmarks", "options"),
+    [(True, ["--no-landmarks"]), (True, ["--method", "inerf", "--start", "start.json"]), (False, [])],
+)
+def test_methods_and_maps_that_do_not_tell_a_focal_length_need_one(
+    bidnerf: Run,
+    photo: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    has_landmarks: bool,
+    options: list[str],
 ) -> None:
-    stored(monkeypatch, landmarks_of(GROUND_CAMERA))
+    open_ground(monkeypatch, assumed=(GROUND_CAMERA,), has_landmarks=has_landmarks)
     monkeypatch.chdir(tmp_path)
     pose = unseen().T_ref_camera.matrix().tolist()
     (tmp_path / "start.json").write_text(json.dumps({"T_world_camera": pose}))
-    status, out, err = bidnerf("localize", *option, "MAP", photo)
+    status, out, err = bidnerf("localize", *options, "MAP", photo)
     assert (status, out) == (1, "")
-    assert "no focal length in EXIF, expected a camera" in err
-
-
-def test_a_map_without_landmarks_does_not_tell_a_focal_length(
-    bidnerf: Run, photo: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stored(monkeypatch, None)
-    status, _, err = bidnerf("localize", "MAP", photo)
-    assert status == 1
     assert "no focal length in EXIF, expected a camera" in err
 
 
 @pytest.mark.parametrize("factor", [0.7, 2.0])
 def test_a_wrong_focal_length_from_the_photo_gives_way_to_that_of_the_map(photo: Path, factor: float) -> None:
-    wrong = replace(GROUND_CAMERA, fx=GROUND_CAMERA.fx * factor, fy=GROUND_CAMERA.fy * factor)
-    frame = Frame.read(photo, CameraSource(assumed=(wrong,)))
+    frame = Frame.read(photo, CameraSource(assumed=(longer(factor),)))
     assert frame.focal_is_approximate
     localizer = Localizer(replace(textured_map(surface=True), landmarks=landmarks_of(GROUND_CAMERA)))
     for given, remark in (
@@ -113,8 +101,7 @@ def test_colours_tell_an_approximate_focal_length_only_with_landmarks(
     photo: Path, factor: float, has_landmarks: bool
 ) -> None:
     """The ground looks nearly flat."""
-    wrong = replace(GROUND_CAMERA, fx=GROUND_CAMERA.fx * factor, fy=GROUND_CAMERA.fy * factor)
-    frame = Frame.read(photo, CameraSource(assumed=(wrong,)))
+    frame = Frame.read(photo, CameraSource(assumed=(longer(factor),)))
     known = landmarks_of() if has_landmarks else None
     found = Localizer(replace(textured_map(surface=True), landmarks=known))(frame)
     assert found.converged == has_landmarks, found.reason
@@ -125,8 +112,7 @@ def test_colours_tell_an_approximate_focal_length_only_with_landmarks(
 
 def test_nor_do_those_of_a_blurred_photo() -> None:
     blurred = faulty(unseen(), "blur:3.5", 0).frame
-    camera = replace(GROUND_CAMERA, fx=GROUND_CAMERA.fx * 1.1, fy=GROUND_CAMERA.fy * 1.1)
-    frame = replace(blurred, depth=None, intrinsics=camera, focal_is_approximate=True)
+    frame = replace(blurred, depth=None, intrinsics=longer(1.1), focal_is_approximate=True)
     assert not Localizer(replace(textured_map(surface=True), landmarks=None))(frame).converged
 
 

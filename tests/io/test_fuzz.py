@@ -13,13 +13,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save
 
-import sparse_model
 import tiny
 from bidnerf import Frame, load_map
 from bidnerf.evaluation import read_results
@@ -30,14 +28,11 @@ from bidnerf_core.depth import read_depth_image
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.io import (
     read_array,
+    read_header,
     read_image,
     read_record,
     read_tensors,
-    to_plain,
 )
-from bidnerf_core.maps import MapInfo, write_parts
-from bidnerf_core.maps import load_map as load
-from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import backend
 from commands import Run
 from damage import (
@@ -56,52 +51,38 @@ from scan_layouts import LAYOUTS, read_all, small_views
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset ``data``, an untrained map ``map``, and a file of each other kind."""
-    folder = tmp_path_factory.mktemp("sound")
-    tiny.write_dataset(folder / "data", train=2, test=1)
-    bounds = tiny.demo_object().bounds
-    info = MapInfo("hashgrid", to_plain(tiny.config()), bounds, step=5, complete=True)
-    field = backend.build(tiny.config(), bounds)
-    write_parts(folder / "map", info, TrainingState(5, field.state_dict(), {}))
-    (folder / "pose.json").write_text(json.dumps({"T_world_camera": np.eye(4).tolist()}))
-    (folder / "camera.json").write_text(json.dumps({"fl_x": 32, "cx": 12, "cy": 12, "w": 24, "h": 24}))
-    (folder / "points.txt").write_text("0 0 1\n0 1 1\n")
-    np.save(folder / "points.npy", np.ones((3, 3)))
-    np.savez(folder / "points.npz", points=np.ones((3, 3)), T_camera_sensor=np.eye(4))
-    np.save(folder / "depth.npy", np.ones((24, 24)))
-    views = tiny.views(3)
-    known = sparse_model.known(views, [f"{view.frame.name}.png" for view in views])
-    sparse_model.write(folder / "sparse", known)
-    sparse_model.to_binary(sparse_model.write(folder / "binary", known))
-    return folder
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of sound files of every kind."""
+    from harness import sound_folder
+
+    return sound_folder(tmp_path_factory.mktemp("fuzz") / "sound")
 
 
 READERS: dict[str, tuple[str, Callable[[bytes], Damages], Callable[[Path], object]]] = {
     # The name of a sound file in the folder, what can be wrong with it, and what reads it.
-    "record": ("data/transforms.json", of_json, read_record),
-    "dataset": ("data/transforms.json", of_json, lambda p: open_dataset(p.parent).views("train")),
+    "record": ("data/transforms_train.json", of_json, read_record),
+    "dataset": ("data/transforms_train.json", of_json, lambda p: open_dataset(p.parent).views("train")),
     "camera": ("camera.json", of_json, lambda p: read_camera(p, (24, 24))),
     "pose": ("pose.json", of_json, read_pose),
-    "map": ("map/map.json", of_json, lambda p: load(p.parent)),
+    "map": ("map/map.json", of_json, lambda p: load_map(p.parent)),
     "results": ("pose.json", of_json, lambda p: read_results([p])),
-    "image": ("data/images/t_0000.png", of_image, read_image),
-    "photo": ("data/images/t_0000.png", of_image, lambda p: Frame.open(p, hfov=40.0)),
-    "depth": ("data/depth/t_0000.png", of_image, lambda p: read_depth_image(p, 0.001)),
-    "depth array": ("depth.npy", of_array, lambda p: read_depth_image(p, 0.001)),
-    "weights": ("map/weights-*", of_tensors, lambda p: load(p.parent)),
-    "COLMAP points": ("sparse/points3D.txt", of_points, lambda p: read_model(p.parent)),
-    "COLMAP images": ("sparse/images.txt", of_points, lambda p: read_model(p.parent)),
-    "COLMAP points, binary": ("binary/points3D.bin", of_colmap, lambda p: read_model(p.parent)),
-    "COLMAP images, binary": ("binary/images.bin", of_colmap, lambda p: read_model(p.parent)),
+    "image": ("photo.png", of_image, read_image),
+    "photo": ("photo.png", of_image, lambda p: Frame.open(p, hfov=40.0)),
+    "depth": ("photo.depth.png", of_image, lambda p: read_depth_image(p, 0.001)),
+    "depth array": ("photo.depth.npy", of_array, lambda p: read_depth_image(p, 0.001)),
+    "weights": ("map/weights-*", of_tensors, lambda p: load_map(p.parent)),
+    "COLMAP points": ("text/points3D.txt", of_points, lambda p: read_model(p.parent)),
+    "COLMAP images": ("text/images.txt", of_points, lambda p: read_model(p.parent)),
+    "COLMAP points, binary": ("colmap/sparse/0/points3D.bin", of_colmap, lambda p: read_model(p.parent)),
+    "COLMAP images, binary": ("colmap/sparse/0/images.bin", of_colmap, lambda p: read_model(p.parent)),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", READERS)
-def test_a_damaged_file_is_refused_in_one_line_or_read(kind: str, folder: Path, tmp_path: Path) -> None:
+def test_a_damaged_file_is_refused_in_one_line_or_read(kind: str, sound: Path, tmp_path: Path) -> None:
     pattern, damages, read = READERS[kind]
-    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
+    copy = Path(shutil.copytree(sound, tmp_path / "copy"))
     (file,) = copy.glob(pattern)
     count = Counter[bool]()
 
@@ -210,22 +191,21 @@ def test_any_words_end_in_a_status_and_printable_text(words: list[str], bidnerf:
 # Files in the place of which something else stands.
 
 
-def pipe(path: Path) -> None:
-    os.mkfifo(path)
-
-
 def hollow(path: Path) -> None:
     """Four gigabytes of which the disk holds nothing."""
     path.touch()
     os.truncate(path, 4 * 2**30)
 
 
-NO_FILES: dict[str, tuple[Callable[[Path], object], str]] = {
-    "a pipe": (pipe, "is a named pipe"),
-    "a folder": (Path.mkdir, "is a folder"),
-    "a device": (lambda path: path.symlink_to("/dev/zero"), "is a device"),
-    "nothing": (lambda path: None, "no such file"),
-    "4 GB": (hollow, "expected"),
+NO_FILES: dict[str, tuple[str, Callable[[Path], object], str]] = {
+    # A name, what is made of that name, and what is said of it.
+    "a pipe": ("x", os.mkfifo, "is a named pipe"),
+    "a folder": ("x", Path.mkdir, "is a folder"),
+    "a device": ("x", lambda path: path.symlink_to("/dev/zero"), "is a device"),
+    "nothing": ("x", lambda path: None, "no such file"),
+    "a zero byte": ("a\0b", lambda path: None, "cannot be opened"),
+    "a long name": ("a" * 300, lambda path: None, "cannot be opened"),
+    "4 GB": ("x", hollow, "expected"),
 }
 FILES: dict[str, Callable[[Path], object]] = {
     "record": read_record,
@@ -234,16 +214,18 @@ FILES: dict[str, Callable[[Path], object]] = {
     "tensors": read_tensors,
     "camera": lambda p: read_camera(p, (24, 24)),
     "array": lambda p: read_array(p, "an array"),
+    "image": read_image,
+    "header of an image": read_header,
 }
 
 
 @pytest.mark.parametrize("kind", FILES)
 @pytest.mark.parametrize("what", NO_FILES)
 def test_what_is_no_file_of_a_usable_size_is_refused_before_it_is_read(kind: str, what: str, tmp_path: Path) -> None:
-    make, said = NO_FILES[what]
-    make(tmp_path / "x")
+    name, make, said = NO_FILES[what]
+    make(tmp_path / name)
     with pytest.raises(InputError, match=said):
-        FILES[kind](tmp_path / "x")
+        FILES[kind](tmp_path / name)
 
 
 @pytest.mark.parametrize(
@@ -263,22 +245,9 @@ def test_arrays_are_judged_by_their_header(kind: str, shape: str, tmp_path: Path
         read_array(tmp_path / "a.npy", "a .npy file")
 
 
-def test_a_field_that_is_larger_than_its_weights_takes_no_memory(folder: Path, tmp_path: Path) -> None:
-    """64 levels of 2^30 entries would be half a terabyte."""
-    shutil.copytree(folder / "map", tmp_path, dirs_exist_ok=True)
-    description = json.loads((tmp_path / "map.json").read_text())
-    description["config"]["encoding"] |= {
-        "levels": 64,
-        "log2_table_size": 30,
-        "finest_resolution": 1e6,
-        "base_resolution": 1e4,
-    }
-    (tmp_path / "map.json").write_text(json.dumps(description))
-    with pytest.raises(InputError, match="tensor 'encoding"):
-        load_map(tmp_path)
-
-
-def test_a_field_that_needs_numbers_to_be_built_is_loaded_too(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_field_that_needs_numbers_to_be_built_is_loaded_too(
+    map_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def build(self: Any, config: Any, bounds: Any) -> Any:
         made = real(self, config, bounds)
         float(next(iter(made.parameters())).flatten()[0])  # fails where there are shapes only
@@ -286,7 +255,7 @@ def test_a_field_that_needs_numbers_to_be_built_is_loaded_too(folder: Path, monk
 
     real = type(backend).build
     monkeypatch.setattr(type(backend), "build", build)
-    assert load_map(folder / "map").info.step == 5
+    assert load_map(map_folder).info.step == tiny.STEPS
 
 
 @pytest.mark.parametrize(

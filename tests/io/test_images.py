@@ -163,22 +163,6 @@ def test_the_first_bytes_count_not_the_name(tmp_path: Path) -> None:
 # Files.
 
 
-@READERS
-def test_what_is_no_file_is_refused_at_once(tmp_path: Path, read: Callable[[Path], object]) -> None:
-    pipe = tmp_path / "pipe.png"
-    os.mkfifo(pipe)
-    for path, found in (
-        (pipe, "is a named pipe"),
-        (tmp_path, "is a folder"),
-        (Path("/dev/null"), "is a device"),
-        (tmp_path / "none.png", "no such file"),
-        (tmp_path / "a\0b.png", "cannot be opened"),
-        (tmp_path / ("a" * 300), "cannot be opened"),
-    ):
-        with refused(where=path, found=found, expected="an image file"):
-            read(path)
-
-
 def test_permission_that_is_denied_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.png"
     Image.fromarray(noise(3, 4)).save(path)

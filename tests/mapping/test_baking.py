@@ -119,13 +119,9 @@ def test_the_grid_has_at_most_the_given_number_of_cells() -> None:
             assert size * surface.cell >= side
 
 
-def bare(view: View) -> View:
-    return View(replace(view.frame, depth=torch.zeros_like(require(view.frame.depth))), view.T_ref_camera)
-
-
 def test_where_nothing_was_seen_there_is_no_surface() -> None:
     with pytest.raises(InputError, match="no surface to bake"):
-        measured([bare(view) for view in ball_views(3)])
+        measured([replace(view, frame=view.frame.replace(depth=torch.zeros(72, 72))) for view in ball_views(3)])
     empty = HomogeneousBall(RADIUS, 1e-3)
     with pytest.raises(InputError, match="no surface to bake"):
         bake(empty, baked.BOUNDS, [(baked.CAMERA, T) for T in orbit(3.5, 3)], config=BakeConfig(rays=2000))
@@ -173,8 +169,8 @@ def test_a_single_image_has_no_noise(generator: Generator) -> None:
 def test_the_footprint_is_that_of_the_full_image_and_the_spacing_that_of_the_thinned_one() -> None:
     view = baked.images(SCENE, 1, seed=0)[0]
     thinned = [posed_measurement(view, view.frame.intrinsics.width * view.frame.intrinsics.height / 9)]
-    assert view.frame.depth is not None
-    distance = float(view.frame.depth[view.frame.depth > 0].median())
+    depth = require(view.frame.depth)
+    distance = float(depth[depth > 0].median())
     assert footprint(thinned, 0.9) == pytest.approx(distance / baked.CAMERA.fx, rel=0.02)
     assert footprint(thinned, 0.9, subsampled=True) == pytest.approx(3 * distance / baked.CAMERA.fx, rel=0.05)
 

@@ -111,26 +111,25 @@ def test_the_gradient_is_the_numerical_one(motion: MotionPrior) -> None:
     capture, given = inaccurate(noise=1.0, outliers=0.1, moving=motion != STILL)
     seen, held = capture.seen(given), prior(given, motion)
     points = capture.points + 0.01
+    size = 6 if motion == STILL else 12
+    of_poses = VIEWS * size
 
-    def cost(of_images: Tensor, of_points: Tensor) -> float:
+    def cost(change: Tensor) -> float:
+        of_images, of_points = change[:of_poses].view(VIEWS, size), change[of_poses:].view(POINTS, 3)
         T = capture.poses.retract(of_images[:, :6])
         moved = Adjustment(T, points + of_points, AT_REST_ALL if motion == STILL else of_images[:, 6:])
         return linearize(seen, moved, held, 1.0, 3.0).cost
 
     system = linearize(seen, at_rest(capture.poses, points), held, 1.0, 3.0)
-    unknowns = 6 if motion == STILL else 12
-    still = torch.zeros(VIEWS, unknowns, dtype=torch.float64)
-    fixed, step = torch.zeros(POINTS, 3, dtype=torch.float64), 1e-6
-    for column in range(unknowns):
-        change = torch.zeros_like(still)
-        change[4, column] = step
-        slope = (cost(change, fixed) - cost(-change, fixed)) / (2 * step)
-        assert slope == pytest.approx(float(system.image_gradient[4, column]), rel=1e-5, abs=1e-3)
-    for column in range(3):
-        change = torch.zeros_like(fixed)
-        change[7, column] = step
-        slope = (cost(still, change) - cost(still, -change)) / (2 * step)
-        assert slope == pytest.approx(float(system.point_gradient[7, column]), rel=1e-5, abs=1e-3)
+    gradient, step = torch.cat([system.image_gradient.ravel(), system.point_gradient.ravel()]), 1e-6
+    for number in (
+        *range(4 * size, 5 * size),
+        *range(of_poses + 21, of_poses + 24),
+    ):  # the fifth image, the eighth point
+        change = torch.zeros_like(gradient)
+        change[number] = step
+        slope = (cost(change) - cost(-change)) / (2 * step)
+        assert slope == pytest.approx(float(gradient[number]), rel=1e-5, abs=1e-3)
 
 
 @pytest.mark.parametrize(("motion", "size"), [(STILL, 6), (MotionPrior(MILLIMETRES, RADIANS), 12)])

@@ -34,10 +34,10 @@ def test_keyframes_show_the_field_from_the_cameras() -> None:
     for view, (intrinsics, T) in zip(found, cameras, strict=True):
         assert view.frame.intrinsics == intrinsics
         assert torch.equal(view.T_ref_camera.matrix(), T.matrix())
-        assert view.frame.depth is not None
-        assert float(view.frame.depth[2, 2]) == pytest.approx(1.5, abs=0.02)  # the nearest point of the ball
+        depth = require(view.frame.depth)
+        assert float(depth[2, 2]) == pytest.approx(1.5, abs=0.02)  # the nearest point of the ball
         torch.testing.assert_close(view.frame.rgb[2, 2], torch.tensor(BALL.rgb), rtol=0, atol=0.5 / 255)
-        assert float(view.frame.depth[0, 0]) == 0  # past the ball
+        assert float(depth[0, 0]) == 0  # past the ball
     assert len({view.frame.name for view in found}) == 3
 
 

@@ -38,10 +38,6 @@ def odd_surface() -> SurfaceMap:
     return replace(baked.toy(), index=replace(baked.toy().index, grid=grid))
 
 
-def no_landmarks() -> LandmarkMap:
-    return landmarks()[torch.tensor([], dtype=torch.long)]
-
-
 KINDS: dict[str, tuple[Callable[[Any], dict[str, Tensor]], Callable[[Mapping[str, Tensor]], Any]]] = {
     "landmarks": (landmark_tensors, landmarks_from_tensors),
     "surface": (surface_tensors, surface_from_tensors),
@@ -52,7 +48,7 @@ KINDS: dict[str, tuple[Callable[[Any], dict[str, Tensor]], Callable[[Mapping[str
     ("kind", "make"),
     [
         ("landmarks", landmarks),
-        ("landmarks", no_landmarks),
+        ("landmarks", lambda: landmarks()[torch.tensor([], dtype=torch.long)]),
         ("surface", baked.toy),
         ("surface", odd_surface),
     ],

@@ -30,6 +30,7 @@ from bidnerf_core.maps import IMPORTERS
 from optional import require
 from photo_room import CAMERA, photograph, walk, write_photos
 from refusals import refused
+from sparse_model import write_model
 
 COUNT = 6
 pytestmark = pytest.mark.skipif(
@@ -70,24 +71,16 @@ class Model:
                 opened.execute("INSERT INTO descriptors VALUES (?, ?, 128, ?)", (number, count, descriptors))
 
 
-def row_of(number: int, T: SE3) -> str:
-    inverse = T.inverse()
-    values = [*inverse.quaternion("wxyz").tolist(), *inverse.translation.tolist()]
-    return f"{number + 1} {' '.join(map(repr, values))} 1 {number:03d}.png"
-
-
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> Model:
     folder, poses = tmp_path_factory.mktemp("model") / "project", walk(COUNT)
-    (folder / "images").mkdir(parents=True)
-    (folder / "sparse").mkdir()
     write_photos(folder / "images", poses)
     views = [
         View(Frame.open(folder / "images" / f"{number:03d}.png", camera=CAMERA), T) for number, T in enumerate(poses)
     ]
     tracked = track_views(views)
     seen, positions = tracked.triangulate(DEFAULT_LANDMARKS)
-    images, keypoints = [f"# {COUNT}"], [image.keypoints for image in tracked.observations.images]
+    images, keypoints = [], [image.keypoints for image in tracked.observations.images]
     first = np.cumsum([0, *map(len, keypoints)])
     point_of = dict(zip(seen.number.tolist(), seen.point.tolist(), strict=True))
     tracks: list[list[str]] = [[] for _ in positions]
@@ -98,16 +91,13 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Model:
             observed.append(f"{u} {v} {point + 1 if point >= 0 else -1}")
             if point >= 0:
                 tracks[point].append(f"{number + 1} {place}")
-        images += [row_of(number, T), " ".join(observed)]
+        images.append((f"{number:03d}.png", 1, T, " ".join(observed)))
+    points = [
+        f"{number + 1} {x} {y} {z} 0 0 0 0.5 {' '.join(track)}"
+        for number, ((x, y, z), track) in enumerate(zip(positions.tolist(), tracks, strict=True))
+    ]
     c = CAMERA
-    (folder / "sparse" / "cameras.txt").write_text(f"1 PINHOLE {c.width} {c.height} {c.fx} {c.fy} {c.cx} {c.cy}\n")
-    (folder / "sparse" / "images.txt").write_text("\n".join(images) + "\n")
-    (folder / "sparse" / "points3D.txt").write_text(
-        "".join(
-            f"{number + 1} {x} {y} {z} 0 0 0 0.5 {' '.join(track)}\n"
-            for number, ((x, y, z), track) in enumerate(zip(positions.tolist(), tracks, strict=True))
-        )
-    )
+    write_model(folder / "sparse", [f"1 PINHOLE {c.width} {c.height} {c.fx} {c.fy} {c.cx} {c.cy}"], images, points)
     return Model(folder, poses, keypoints)
 
 
@@ -192,11 +182,6 @@ def test_keypoints_of_another_model_are_not_used(
     given = {"keypoints": str(model.folder / "database.db")}
     with refused(where="database.db", found="keypoints of 000.png, the model", expected="the keypoints of"):
         bn.import_map(model.folder, None, given)
-    model.write_database(tmp_path / "aliked.db")
-    with contextlib.closing(sqlite3.connect(tmp_path / "aliked.db")) as opened, opened:
-        opened.execute("UPDATE descriptors SET cols = 4 * cols, data = zeroblob(4 * rows * cols)")
-    with refused(where="aliked.db", found="its descriptors have 512 bytes, those of SIFT 128"):
-        bn.import_map(model.folder, None, {"keypoints": str(tmp_path / "aliked.db")})
     (tmp_path / "other.db").write_bytes(b"no database")
     with refused(where="other.db", found="cannot be read", expected="a database of COLMAP"):
         bn.import_map(model.folder, None, {"keypoints": str(tmp_path / "other.db")})
@@ -241,6 +226,7 @@ DATABASES = {
     "DROP TABLE images; CREATE TABLE images (image_id, name AS (zeroblob(900000000)));"
     "INSERT INTO images VALUES (0)": "too big",
     "UPDATE keypoints SET cols = 0, data = x''": "keypoints (x, y)",
+    "UPDATE descriptors SET cols = 4 * cols, data = zeroblob(4 * rows * cols)": "have 512 bytes, those of SIFT 128",
     "UPDATE keypoints SET rows = 'many'": "image '000.png'",
     "UPDATE descriptors SET rows = 9223372036854775807": "image '000.png'",
     "DROP TABLE descriptors": "no such table",
@@ -262,51 +248,45 @@ def test_a_database_is_only_what_it_stores(model: Model, change: str) -> None:
     assert str(file) in str(error.value)
 
 
-def _change_features(group: Any, how: str, file: Path) -> None:
-    import h5py
-
-    if how == "cycle":  # which no name of an image leads into
-        group.file["a"] = group.file["/"]
-    elif how == "soft link":
-        del group["keypoints"]
-        group["keypoints"] = h5py.SoftLink("/000.png")
-    elif how == "never written":
-        del group["keypoints"]
-        group.create_dataset("keypoints", (400_000_000, 2), dtype="f4", chunks=(1000, 2))
-    elif how == "compressed":
-        del group["scales"]
-        group.create_dataset("scales", (10**8,), dtype="f4", fillvalue=1, compression="gzip")
-    elif how == "elsewhere":
-        del group["descriptors"]
-        group.create_dataset("descriptors", (128, 10), dtype="u1", external=[(str(file), 0, 1280)])
-    else:
-        other = {"rank": np.ones((9, 2)), "text": np.array([b"a"] * 9), "NaN": np.full(len(group["scales"]), np.nan)}
-        del group["scales"]
-        group["scales"] = other[how]
+DATASETS: dict[str, tuple[str, dict[str, Any]]] = {
+    "000.png/keypoints is a link": ("keypoints", {}),
+    "declares 3,200,000,000 bytes that are not stored": (
+        "keypoints",
+        {"shape": (400_000_000, 2), "dtype": "f4", "chunks": (1000, 2)},
+    ),
+    "scales is compressed or in another file": (
+        "scales",
+        {"shape": (10**8,), "dtype": "f4", "fillvalue": 1, "compression": "gzip"},
+    ),
+    "descriptors is compressed or in another file": (
+        "descriptors",
+        {"shape": (128, 9), "dtype": "u1", "external": [("other", 0, 1280)]},
+    ),
+    "[9, 2]": ("scales", {"data": np.ones((9, 2))}),
+    "an array of numbers": ("scales", {"data": np.array([b"a"] * 9)}),
+    "keypoints of NaN": ("scales", {"data": np.full(9, np.nan)}),
+}
 
 
-@pytest.mark.parametrize(
-    ("how", "expected"),
-    [
-        ("cycle", ""),
-        ("soft link", "000.png/keypoints is a link"),
-        ("never written", "declares 3,200,000,000 bytes that are not stored"),
-        ("compressed", "is compressed or in another file"),
-        ("elsewhere", "is compressed or in another file"),
-        ("rank", "[9, 2]"),
-        ("text", "an array of numbers"),
-        ("NaN", "keypoints of NaN"),
-    ],
-)
-def test_features_are_arrays_of_numbers_in_the_file_itself(model: Model, how: str, expected: str) -> None:
-    file = model.folder / "features.h5"
-    write_features(file, model.keypoints)
+@pytest.mark.parametrize("expected", DATASETS)
+def test_features_are_arrays_of_numbers_in_the_file_itself(tmp_path: Path, expected: str) -> None:
     h5py = pytest.importorskip("h5py")
+    file = tmp_path / "features.h5"
+    write_features(file, [Keypoints(torch.ones((9, 2)), torch.ones(9), torch.zeros((9, 128), dtype=torch.uint8))])
     with h5py.File(file, "r+") as opened:
-        _change_features(opened["000.png"], how, model.folder / "sparse/images.txt")
-    with contextlib.nullcontext() if how == "cycle" else refused(where=file, found=None) as caught:
+        opened["a"] = opened["/"]  # a cycle, which no name of an image leads into
+    assert list(stored_keypoints(file, ["000.png"])) == ["000.png"]
+    name, options = DATASETS[expected]
+    with h5py.File(file, "r+") as opened:
+        group = opened["000.png"]
+        del group[name]
+        if options:
+            group.create_dataset(name, **options)
+        else:
+            group[name] = h5py.SoftLink("/000.png")
+    with refused(where=file, found=None) as caught:
         stored_keypoints(file, ["000.png"])
-    assert how == "cycle" or expected in str(caught.error)
+    assert expected in str(caught.error)
     file.write_bytes(file.read_bytes()[:3000] + bytes(2000))
     with refused(where=file, expected="features of hloc"):
         stored_keypoints(file, ["000.png"])

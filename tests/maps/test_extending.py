@@ -20,6 +20,7 @@ from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.maps.extending import localize_new
 from bidnerf_core.progress import job_context
 from commands import Run
+from optional import require
 from photo_files import write_photo
 from refusals import refused
 
@@ -48,17 +49,16 @@ def map_folder(stored: Path, tmp_path: Path) -> Path:
 def test_new_photos_are_located_and_added(map_folder: Path) -> None:
     before, new = bn.load_map(map_folder), training_views()[7:]
     after = bn.extend(map_folder, new, steps=STEPS, config=BAKE)
+    few, more = (len(require(scene.landmarks)) for scene in (before, after))
     assert [camera.name for camera in after.info.cameras[7:]] == [each.frame.name for each in new]
     for camera, truth in zip(after.info.cameras[7:], new, strict=True):
         assert float((camera.pose.translation - truth.T_ref_camera.translation).norm()) < 0.03
-    assert before.landmarks is not None
-    assert after.landmarks is not None
-    assert len(before.landmarks) < len(after.landmarks) < 2 * len(before.landmarks)
+    assert few < more < 2 * few
     assert (after.info.added, after.info.step) == (3, before.info.step + STEPS)
     assert "10 images, 3 of which were added later" in str(after.describe())
     again = bn.load_map(map_folder)
     assert again.info == after.info
-    assert len(again.landmarks or ()) == len(after.landmarks)
+    assert len(require(again.landmarks)) == more
     assert bn.Localizer(again)(new[0].frame).converged
 
 
@@ -125,8 +125,7 @@ def test_the_images_of_the_map_may_be_given(map_folder: Path) -> None:
         for v in training_views()[:7]
     ]
     new = training_views()[7]
-    assert new.frame.depth is not None
-    new = replace(new, frame=replace(new.frame, depth=2 * new.frame.depth))
+    new = replace(new, frame=replace(new.frame, depth=2 * require(new.frame.depth)))
     after = bn.extend(large, [new], old, steps=STEPS, config=BAKE)
     assert len(after.info.cameras) == 8
     assert after.folder is None

@@ -27,7 +27,7 @@ from bidnerf_core.registry import PluginError
 from bidnerf_hashgrid import backend as hashgrid
 from optional import require
 from refusals import refused
-from trainings import assert_same_tensors
+from trainings import assert_same_tensors, stopping_at
 
 BAKE = BakeConfig(cells=5000)
 DESCENT = settings_of("bid", {"rays": 64, "max_steps": 3})
@@ -98,24 +98,15 @@ def test_a_folder_a_path_a_dataset_and_views_give_the_same_map(tmp_path: Path) -
 
 def test_an_incomplete_map_is_saved_with_what_resuming_needs(whole: bn.Map, tmp_path: Path) -> None:
     with pytest.raises(bn.Cancelled):
-        trained(tmp_path / "map", **after(5))
+        trained(tmp_path / "map", **stopping_at("training", 5))
     half = bn.load_map(tmp_path / "map").save(tmp_path / "copy")
     assert not half.info.complete
     assert_same_field(bn.resume(tmp_path / "copy", tiny.views(), bake=False), whole)
 
 
-def after(steps: int) -> dict[str, Any]:
-    """Return the options of a training that is cancelled in that step."""
-    seen = list[Progress]()
-    return {
-        "progress": seen.append,
-        "cancel": lambda: any(now.stage == "training" and now.done >= steps for now in seen),
-    }
-
-
 def test_cancelled_and_resumed_equals_uninterrupted(whole: bn.Map, tmp_path: Path) -> None:
     with pytest.raises(bn.Cancelled, match=r"saved after step 5; `resume`"):
-        trained(tmp_path / "half", **after(5))
+        trained(tmp_path / "half", **stopping_at("training", 5))
     info = load_info(tmp_path / "half")
     assert (info.step, info.complete) == (5, False)
     resumed = bn.resume(tmp_path / "half", tiny.views(), bake=False)
@@ -136,12 +127,6 @@ def test_cancelled_and_resumed_equals_uninterrupted(whole: bn.Map, tmp_path: Pat
     assert surveyed.info.surface == surface
     with refused(where=tmp_path / "half", found="complete (12 steps) and baked, nothing to resume"):
         bn.resume(tmp_path / "half", tiny.views())
-
-
-def stopping_at(stage: str) -> dict[str, Any]:
-    """Return the options of a job that is cancelled in a stage."""
-    seen = list[str]()
-    return {"progress": lambda now: seen.append(now.stage), "cancel": lambda: stage in seen}
 
 
 @pytest.mark.parametrize("stage", ["training", "baking"])
@@ -176,7 +161,7 @@ def test_cancelling_before_training_leaves_nothing(tmp_path: Path) -> None:
         trained(tmp_path / "map", cancel=lambda: True)
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(bn.Cancelled, match="nothing is stored"):
-        trained(**after(3))
+        trained(**stopping_at("training", 3))
 
 
 class Failed(Exception):
@@ -279,9 +264,9 @@ def test_a_rendering_is_scored_against_the_photo(scene: bn.Map) -> None:
     scores = rendering_scores(image, view.frame)
     error = (image.rgb - view.frame.rgb).square().mean()
     assert scores.psnr == pytest.approx(float(-10 * error.log10()), abs=1e-3)
-    assert view.frame.depth is not None
-    assert len(scores.depth_errors) == int((view.frame.depth > 0).sum())
-    perfect = rendering_scores(type(image)(view.frame.rgb, view.frame.depth, image.opacity), view.frame)
+    depth = require(view.frame.depth)
+    assert len(scores.depth_errors) == int((depth > 0).sum())
+    perfect = rendering_scores(type(image)(view.frame.rgb, depth, image.opacity), view.frame)
     assert perfect.depth_error == 0
     assert not torch.equal(scene.render(view, level=0).rgb, image.rgb)
     with refused(where="map in memory", found="no level 2", expected="0 to 1"):

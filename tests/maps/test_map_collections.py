@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,11 +23,11 @@ from bidnerf.testing import textured_view as view
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.fields import NoField
-from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import BakeConfig, bake, build_landmarks
 from bidnerf_core.mapping.landmarks.vocabulary import visible
 from bidnerf_core.maps import Map, MapInfo, maps_in, name_maps
 from commands import Run
+from localizations import answer
 from optional import require
 from refusals import refused
 
@@ -64,9 +63,8 @@ def test_the_map_that_an_image_shows_is_found(grounds: list[Map]) -> None:
     assert (found.map, found.converged) == ("ground4", True)
     assert next(iter(found.ranking)) == found.map
     assert len(found.tried) == 2
-    assert found.runner_up is not None
-    assert found.runner_up[0] == list(found.ranking)[1]
-    assert not found.runner_up[1].converged
+    name, second = require(found.runner_up)
+    assert (name, second.converged) == (list(found.ranking)[1], False)
     alone = bn.Localizer(grounds[1], warm_up=False)(image.frame)
     assert torch.equal(found.found.T_world_camera.matrix(), alone.T_world_camera.matrix())
 
@@ -98,9 +96,9 @@ def test_a_map_without_a_field_is_found_by_its_landmarks(grounds: list[Map]) -> 
     found = bn.MapCollection([grounds[0], alone])(photo(SEEDS[1]).frame)
     assert (found.map, found.converged) == ("alone", True)
     rival = bn.MapCollection([grounds[1], alone])(photo(SEEDS[1]).frame)
-    assert rival.runner_up is not None
-    assert rival.runner_up[1].converged
-    assert {rival.map, rival.runner_up[0]} == {"ground4", "alone"}
+    name, second = require(rival.runner_up)
+    assert second.converged
+    assert {rival.map, name} == {"ground4", "alone"}
 
 
 @pytest.mark.slow
@@ -141,9 +139,7 @@ def test_the_limit_counts_only_maps_that_can_be_compared(grounds: list[Map], mon
     """Maps without landmarks cannot be ranked, so that any of them may be the one that the image shows."""
     bare = {f"bare{n}": grounds[2] for n in range(7)}
     maps = bn.MapCollection({**bare, "ground0": grounds[0], "ground4": grounds[1]}, limit=1)
-    T = SE3.identity()
-    nothing = "nothing matches", 0, 0.0, math.nan, "auto", SE3.stack([T]), torch.zeros(0, dtype=torch.float64)
-    none = bn.Localization(T, bn.Outcome.TOO_FEW_MATCHES, *nothing)
+    none = answer(outcome=bn.Outcome.TOO_FEW_MATCHES)
     monkeypatch.setattr(maps, "_by_landmarks", lambda *_: none)
     monkeypatch.setattr(maps, "localizer", lambda name: lambda frame, seed: none)
     assert maps(photo(SEEDS[1]).frame).tried == ("ground4", *bare)
@@ -198,9 +194,9 @@ def test_the_command(bidnerf: Run, grounds: list[Map], tmp_path: Path, monkeypat
     file = tmp_path / "photo.png"
     iio.imwrite(file, (255 * view(POSES[1], "", SEEDS[1]).frame.rgb).round().to(torch.uint8).numpy())
     out = bidnerf("localize", tmp_path / "maps", file, "--focal", 130, "--json").succeed().out
-    answer = json.loads(out)
-    assert (answer["map"], answer["converged"]) == ("m4", True)
-    assert answer["runner_up"]["converged"] is False
+    found = json.loads(out)
+    assert (found["map"], found["converged"]) == ("m4", True)
+    assert found["runner_up"]["converged"] is False
     assert len(loaded) == 2
     two = (tmp_path / "maps" / "m0", tmp_path / "maps" / "m4")
     out = bidnerf("localize", *two, file, "--focal", 130, "--out", tmp_path / "poses.json").succeed().out

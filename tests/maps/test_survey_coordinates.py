@@ -39,9 +39,9 @@ from bidnerf_core.maps import ImportedField, ImportOptions
 # Inside: where a map's own coordinates begin, and what the names of its places mean
 from bidnerf_core.maps.known_lengths import locate_point
 from bidnerf_core.maps.views import choose_origin
-from bidnerf_core.progress import Progress
 from bidnerf_core.registry import registered
 from optional import require
+from trainings import stopping_at
 
 ORIGIN = (500_000.0, 4_000_000.0, 100.0)
 OFFSET = torch.tensor(ORIGIN, dtype=torch.float64)
@@ -173,15 +173,13 @@ def test_a_dataset_is_trained_interrupted_resumed_and_baked(tmp_path: Path) -> N
         for row, shift in zip(frame["transform_matrix"], ORIGIN, strict=False):
             row[3] += shift
     (folder / "transforms.json").write_text(json.dumps(content))
-    seen = list[Progress]()
     with pytest.raises(Cancelled):
         train(
             folder,
             out=tmp_path / "map",
             config=tiny.config(20),
             bake=False,
-            progress=seen.append,
-            cancel=lambda: any(now.stage == "training" and now.done >= 10 for now in seen),
+            **stopping_at("training", 10),
         )
     whole = resume(tmp_path / "map", folder, bake=SMALL)
     assert whole.info.complete

@@ -89,8 +89,7 @@ def test_every_tensor_of_a_map_moves_and_keeps_its_value(backend: str) -> None:
 def test_what_lies_there_already_is_not_copied() -> None:
     stored = whole_map("hashgrid")
     assert stored.to("cpu") is stored
-    assert stored.surface is not None
-    assert stored.surface.to(CPU) is stored.surface
+    assert require(stored.surface).to(CPU) is stored.surface
     assert landmarks().to("cpu") is landmarks()
     assert Localizer(stored, "bid", device="cpu", warm_up=False).scene is stored
 

@@ -231,16 +231,13 @@ def exists(command: list[str], targets: set[str]) -> bool:
     if program == "make":
         return set(arguments) <= targets
     if program == "pip":
-        return extras(arguments) <= {*PROJECT["optional-dependencies"], "test"}
+        extras = ",".join(re.findall(r"\[([\w,]+)\]", " ".join(arguments))).split(",")
+        return {*extras} <= {"", *PROJECT["optional-dependencies"], "test"}
     if program == "cp":
         return (ROOT / arguments[1]).exists()
     if program == "python":
         return (ROOT / arguments[0]).is_file()
     return program in {"bidnerf", *OTHER_PROGRAMS}
-
-
-def extras(arguments: list[str]) -> set[str]:
-    return {name for word in arguments for names in re.findall(r"\[([\w,]+)\]", word) for name in names.split(",")}
 
 
 @pytest.mark.slow

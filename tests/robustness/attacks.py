@@ -36,7 +36,7 @@ from bidnerf_core.io import Archive, read_array, read_image, read_ply, read_save
 from bidnerf_core.maps import load_map
 from bombs import png_of
 from damage import zeros_png
-from harness import Check, Checks, defects, run, sound_folder
+from harness import Check, Checks, defects, instead, run, sound_folder
 from scan_layouts import LAYOUTS, every_frame, read_all, small_views
 
 SECONDS, MEMORY = 30.0, 2**30
@@ -54,11 +54,6 @@ def with_word(place: int, word: bytes, file: Path) -> None:
     if found := list(NUMBER.finditer(content)):
         start, end = found[place * (len(found) - 1) // 64].span()
         file.write_bytes(content[:start] + word + content[end:])
-
-
-def instead(make: Edit, file: Path) -> None:
-    file.unlink()
-    make(file)
 
 
 def content(change: Callable[[bytes], bytes]) -> Edit:

@@ -49,6 +49,7 @@ from harness import (
     Door,
     defects,
     files_of,
+    instead,
     localize_photo,
     localizer,
     photo,
@@ -82,10 +83,6 @@ def frame_door(**options: Any) -> Callable[[Path], object]:
     return door
 
 
-def load(folder: Path) -> object:
-    return load_map(folder / "map")
-
-
 def restore(folder: Path) -> None:
     """Restore a tracker from its stored state, and track two frames more."""
     tracker = Tracker(localizer(folder))
@@ -110,7 +107,7 @@ OF_MAP: list[FolderDoor] = [
     FRAME,
     [*EVALUATE, "{}/new.jsonl"],
     BAKE,
-    load,
+    lambda folder: load_map(folder / "map"),
     localize_photo,
     ["train", "{}/data", "--out", "{}/map", "--resume"],
 ]
@@ -119,7 +116,7 @@ OF_BAKED: list[FolderDoor] = [
     ["localize", "{}/map", "{}/data", *AUTO],
     BAKE,
     TRACK,
-    load,
+    lambda folder: load_map(folder / "map"),
     localize_photo,
     [*SEARCH, "{}/new.jsonl"],
 ]
@@ -164,23 +161,15 @@ TARGETS: list[tuple[str, Callable[[bytes], Damages], list[FolderDoor]]] = [
 # Other things in place of a file.
 
 
-def instead(make: Callable[[Path], object]) -> Callable[[Path], object]:
-    def place(path: Path) -> None:
-        path.unlink()
-        make(path)
-
-    return place
-
-
 PLACES: dict[str, Callable[[Path], object]] = {
     "no permission": lambda path: path.chmod(0),
-    "a folder": instead(Path.mkdir),
-    "a pipe": instead(os.mkfifo),
+    "a folder": partial(instead, Path.mkdir),
+    "a pipe": partial(instead, os.mkfifo),
     "missing": Path.unlink,
-    "link to nothing": instead(lambda path: path.symlink_to("nowhere")),
-    "link to itself": instead(lambda path: path.symlink_to(path)),
-    "link to /dev/zero": instead(lambda path: path.symlink_to("/dev/zero")),
-    "link to /dev/random": instead(lambda path: path.symlink_to("/dev/random")),
+    "link to nothing": partial(instead, lambda path: path.symlink_to("nowhere")),
+    "link to itself": partial(instead, lambda path: path.symlink_to(path)),
+    "link to /dev/zero": partial(instead, lambda path: path.symlink_to("/dev/zero")),
+    "link to /dev/random": partial(instead, lambda path: path.symlink_to("/dev/random")),
     "4 GB of zeros": lambda path: os.truncate(path, 4 * 2**30),  # of which the disk holds nothing
     "another file": lambda path: path.write_bytes(struct.pack("<QQ", 8, 0) + b"\x7fELF" * 30),
 }

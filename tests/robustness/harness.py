@@ -85,7 +85,9 @@ def sound_folder(folder: Path, test: int = 2) -> Path:
     iio.imwrite(folder / "photo.depth.png", millimetres(unseen[0]))
     np.save(folder / "photo.depth.npy", metres(unseen[0]))
     names = [f"{number}.png" for number in range(1, 7)]
-    sparse_model.to_binary(sparse_model.write(folder / "colmap/sparse/0", sparse_model.known(seen, names)))
+    known = sparse_model.known(seen, names)
+    sparse_model.write(folder / "text", known)
+    sparse_model.to_binary(sparse_model.write(folder / "colmap/sparse/0", known))
     for name, view in zip(names, seen, strict=True):
         write_image(folder / "colmap/images" / name, pixels(view))
     words = ("--protocol", "none", "--trials", "1", "--workers", "1", *AUTO)
@@ -108,6 +110,12 @@ def localizer(folder: Path) -> Localizer:
 
 def localize_photo(folder: Path, frame: Frame | None = None, **options: Any) -> Localization:
     return localizer(folder)(photo(folder) if frame is None else frame, **options)
+
+
+def instead(make: Callable[[Path], object], file: Path) -> None:
+    """Put something else in the place of a file."""
+    file.unlink()
+    make(file)
 
 
 # Cases in a child.

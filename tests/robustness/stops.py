@@ -93,7 +93,13 @@ def jobs(sound: Path) -> dict[str, Job]:
         "bake": Job(baking, step_of, lambda folder: parts(folder, ("surface", "landmarks"))),
         "evaluate": Job(trials, lambda folder: len(rows(folder / "r.jsonl")), lambda folder: rows(folder / "r.jsonl")),
         "report": Job(
-            lambda folder: ["report", sound / "results.jsonl", "--out", folder / "report"], pages, files_of_report
+            lambda folder: ["report", sound / "results.jsonl", "--out", folder / "report"],
+            pages,
+            lambda folder: {
+                file.name: file.read_bytes()
+                for file in (folder / "report").iterdir()
+                if not TEMPORARY.fullmatch(file.name)
+            },
         ),
         "localize": answers(
             "localize", "--json", "--perturb", "0.1", "5", "--method", "bid", "--max-steps", "12", "--rays", "64"
@@ -141,11 +147,6 @@ def pages(folder: Path) -> int:
     if "Unfinished report" not in text and not text.rstrip().endswith("</html>"):
         raise Broken("half of a page")
     return int("Unfinished report" not in text)
-
-
-def files_of_report(folder: Path) -> object:
-    files = (file for file in (folder / "report").iterdir() if not TEMPORARY.fullmatch(file.name))
-    return {file.name: file.read_bytes() for file in files}
 
 
 def run_undisturbed(job: Job, folder: Path) -> float:

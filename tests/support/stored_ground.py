@@ -13,27 +13,30 @@ from bidnerf import SE3, Frame, Intrinsics, Map, View, evaluation
 from bidnerf.testing import textured_map
 from bidnerf_core.captures import StoredCamera
 from bidnerf_core.datasets import write_transforms
+from bidnerf_core.mapping import LandmarkMap
 from bidnerf_core.maps import MapInfo
 from optional import require
 
 
+def landmarks_of(*cameras: Intrinsics) -> LandmarkMap:
+    """Return the landmarks of the ground, as if trial photos by these cameras had been localized in the map."""
+    scatter = torch.full((4,), 0.001, dtype=torch.float64)
+    return replace(require(textured_map().landmarks), cameras=cameras, calibration_scatter=scatter)
+
+
 def open_ground(
-    patch: pytest.MonkeyPatch, cameras: Sequence[StoredCamera] = (), assumed: tuple[Intrinsics, ...] = ()
+    patch: pytest.MonkeyPatch,
+    cameras: Sequence[StoredCamera] = (),
+    assumed: tuple[Intrinsics, ...] = (),
+    has_landmarks: bool = True,
 ) -> None:
     """Let commands open the ground, whatever folder they name. ``assumed``: the landmarks' cameras, if given."""
     known = textured_map(surface=True)
-    landmarks = require(known.landmarks)
-    if assumed:  # as if trial photos by that camera had been localized in the map
-        scatter = torch.full((4,), 0.001, dtype=torch.float64)
-        landmarks = replace(landmarks, cameras=assumed, calibration_scatter=scatter)
+    landmarks = landmarks_of(*assumed) if assumed else known.landmarks
     info = MapInfo(
         "ground", {}, known.bounds, 1, True, "data", weights="ground", cameras=tuple(cameras), colour_noise=0.0
     )
-    open_map(patch, Map(info, known.field, known.surface, landmarks))
-
-
-def open_map(patch: pytest.MonkeyPatch, scene: object) -> None:
-    """Let commands open a map, whatever folder they name."""
+    scene = Map(info, known.field, known.surface, landmarks if has_landmarks else None)
     for name in evaluation.__all__:  # which would otherwise be imported with what is patched, and keep it
         getattr(evaluation, name)
     patch.setattr("bidnerf_core.maps.load_map", lambda folder, device="cpu": scene)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from bidnerf_core.maps import Checkpoints, load_info
+from bidnerf_core.progress import Progress
 from bidnerf_core.training import TrainingStep
 
 
@@ -25,6 +27,15 @@ def stop_at(patch: pytest.MonkeyPatch, number: int) -> None:
         original(self, now)
 
     patch.setattr(Checkpoints, "step", step)
+
+
+def stopping_at(stage: str, number: int = 0) -> dict[str, Any]:
+    """Return the options of a job that is cancelled in a stage, when so many of its steps are done."""
+    seen = list[Progress]()
+    return {
+        "progress": seen.append,
+        "cancel": lambda: any(now.stage == stage and now.done >= number for now in seen),
+    }
 
 
 def assert_same_tensors(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:

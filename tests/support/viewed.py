@@ -7,15 +7,13 @@ import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
 from PIL import Image
 
 from bidnerf import SE3, Frame, TrainOptions, View, train
 from bidnerf_core.datasets import Query
 from bidnerf_core.mapping import BakeConfig
 from optional import require
-from photo_room import CAMERA, HALF, photograph
+from photo_room import CAMERA, photograph, room_depth
 from photo_room import walk as walk
 from tiny import config
 
@@ -24,9 +22,7 @@ HOSTILE = "<script>document.title = 'run'</script>"
 
 def posed(T: SE3, name: str, seed: int = 0) -> View:
     """Return a photo of the room with exact depth."""
-    rays = T.rotate(CAMERA.unproject(CAMERA.pixel_centres(torch.float64))).numpy()
-    with np.errstate(divide="ignore"):
-        depth = ((np.sign(rays) * HALF - T.translation.numpy()) / rays).min(-1)
+    depth = room_depth(T).numpy()
     return View(Frame.from_numpy(photograph(T, seed), CAMERA, depth=depth, depth_unit=1.0, name=name), T)
 
 

@@ -9,13 +9,14 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core.fields import Rays, RaySamples, Rendering, render, rendering_weights
+from bidnerf_core.fields import RadianceField, Rays, RaySamples, Rendering, render, rendering_weights
 from bidnerf_core.frames import SeenLandmarks, View
 from bidnerf_core.training import RayBank, TrainingBatch, ray_termination, supervised_loss
 
 # Inside: single terms of the loss are compared with their definitions, integrals and differences
 from bidnerf_core.training.loss import distortion, expected_distance
 from bidnerf_core.training.ray_bank import LANDMARK_SHARE
+from optional import require
 from small_backends import BACKENDS, BOUNDS, train_field
 
 
@@ -40,14 +41,14 @@ def test_the_derivative_is_the_numerical_one() -> None:
 
 def thinned(view: View, every: int) -> View:
     """The view with every so many of the pixels of its depth image alone."""
-    assert view.frame.depth is not None
-    kept = torch.zeros_like(view.frame.depth).reshape(-1)
-    index = view.frame.depth.reshape(-1).nonzero()[::every, 0]
-    kept[index] = view.frame.depth.reshape(-1)[index]
-    return replace(view, frame=replace(view.frame, depth=kept.reshape(view.frame.depth.shape)))
+    depth = require(view.frame.depth)
+    kept = torch.zeros_like(depth)
+    index = depth.nonzero()[::every].unbind(-1)
+    kept[index] = depth[index]
+    return replace(view, frame=replace(view.frame, depth=kept))
 
 
-def misplaced(field: Any, views: Sequence[View]) -> float:
+def misplaced(field: RadianceField, views: Sequence[View]) -> float:
     """The depth term where depth was measured: mean distance of the weight from there, metres."""
     batch = RayBank(views, BOUNDS).draw(3000, torch.Generator().manual_seed(1))
     with torch.no_grad():
@@ -94,11 +95,11 @@ def test_a_landmark_pulls_weight_to_itself_and_less_the_less_certain_it_is() -> 
 
 def seen(view: View, every: int) -> View:
     """The view with the depth of some pixels as landmarks, and no depth."""
-    assert view.frame.depth is not None
-    rows, columns = (index[::every] for index in (view.frame.depth > 0).nonzero(as_tuple=True))
+    depth = require(view.frame.depth)
+    rows, columns = (depth > 0).nonzero()[::every].unbind(-1)
     pixels = torch.stack([columns, rows], dim=-1) + 0.5
     ray = view.frame.intrinsics.unproject(pixels)
-    distance = view.frame.depth[rows, columns] * torch.linalg.vector_norm(ray, dim=-1)
+    distance = depth[rows, columns] * torch.linalg.vector_norm(ray, dim=-1)
     landmarks = SeenLandmarks(pixels, distance, torch.full_like(distance, 0.01))
     return replace(view, frame=replace(view.frame, depth=None), landmarks=landmarks)
 
