@@ -79,8 +79,10 @@ def amount(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
-def enumeration(parts: Sequence[str]) -> str:
-    """Join parts with commas and a final "and", as in a sentence: a, b and c."""
+def enumeration(parts: Sequence[str], most: int | None = None) -> str:
+    """Join parts with commas and a final "and", as in a sentence: a, b and c; if there are more than ``most``: a, b and 7 more."""
+    if most is not None and len(parts) > most:
+        parts = [*parts[:most], f"{len(parts) - most} more"]
     return " and ".join([*filter(None, [", ".join(parts[:-1])]), *parts[-1:]])
 
 

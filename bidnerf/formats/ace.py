@@ -55,7 +55,7 @@ def read_matrix(file: Path, size: tuple[int, int], first_centre: float = 0.5) ->
     ``first_centre`` is added to a principal point, see ``camera_of``. Raises ``InputError`` for a file with none of these.
     """
     expected = "a matrix of intrinsics, 3x3 or 4x4"
-    rows = [row.numbers() for row in read_rows(file, "intrinsics", expected)]
+    rows = [row.numbers(row.text.replace(",", " ").split()) for row in read_rows(file, "intrinsics", expected)]
     match rows:
         case [[f]]:
             numbers = f, f, size[0] / 2 - first_centre, size[1] / 2 - first_centre

@@ -58,10 +58,6 @@ def _read(path: Path, root: Path, options: DatasetOptions) -> Capture:
     )
 
 
-def _find(path: Path) -> Path | None:
-    return next((root for root in (path / "mav0", path) if is_file(root / "cam0" / "data.csv")), None)
-
-
 def _sensor(file: Path, options: DatasetOptions) -> tuple[CameraSource, SE3]:
     """Return the camera (given or calibrated) and T_body_camera. Raises ``InputError`` for an invalid file."""
     values = parse_yaml(read_file(file, EXPECTED_SENSOR), str(file), EXPECTED_SENSOR)
@@ -82,7 +78,7 @@ def _sensor(file: Path, options: DatasetOptions) -> tuple[CameraSource, SE3]:
 reader = Format(
     "EuRoC and others in the ASL layout: poses of the body, interpolated",
     "mav0/cam0/data.csv with mav0/cam0/sensor.yaml (EuRoC)",
-    _find,
+    lambda path: next((root for root in (path / "mav0", path) if is_file(root / "cam0" / "data.csv")), None),
     _read,
     ["camera"],
     may_lack_poses=True,

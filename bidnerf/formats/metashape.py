@@ -35,7 +35,16 @@ from bidnerf_core.io import parse_xml, read_file
 
 def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
     """Read the cameras. Raises ``InputError`` if one is invalid."""
-    chunk = _chunk(file)
+    expected = "cameras exported by Metashape"
+    chunks = parse_xml(read_file(file, expected), str(file), expected).findall("chunk")
+    if not chunks:
+        raise InputError("has no chunk", where=file, expected=expected)
+    chunk, *others = sorted(chunks, key=lambda chunk: -len(chunk.findall(".//camera")))
+    if any(other.find(".//camera") is not None for other in others):
+        count = len(chunk.findall(".//camera"))
+        warn_about(
+            file, f"has {len(chunks)} chunks, of which the one with {count} cameras is used; export the others alone"
+        )
     sensors = {sensor.get("id"): sensor for sensor in chunk.iter("sensor")}
     lenses = {key: _camera(sensor, f"{file}: sensor {key}") for key, sensor in sensors.items()}
     metric = chunk.find("transform/scale")
@@ -80,21 +89,6 @@ def _find(path: Path) -> Path | None:
     """Return the first XML file in whose first bytes the root and a chunk begin."""
     heads = file_heads(path, "[!.]*.xml", "cameras of Metashape")
     return next((file for file, head in heads if b"<document" in head and b"<chunk" in head), None)
-
-
-def _chunk(file: Path) -> Element:
-    """Return the chunk with the most cameras, with a remark if several have cameras. Raises ``InputError`` for invalid XML."""
-    expected = "cameras exported by Metashape"
-    chunks = parse_xml(read_file(file, expected), str(file), expected).findall("chunk")
-    if not chunks:
-        raise InputError("has no chunk", where=file, expected=expected)
-    count = [sum(1 for _ in chunk.iter("camera")) for chunk in chunks]
-    if len(count) - count.count(0) > 1:
-        warn_about(
-            file,
-            f"has {len(chunks)} chunks, of which the one with {max(count)} cameras is used; export the others alone",
-        )
-    return chunks[count.index(max(count))]
 
 
 def _components(file: Path, chunk: Element) -> dict[str | None, Similarity | None]:

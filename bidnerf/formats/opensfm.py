@@ -76,10 +76,6 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
     return Capture(path, names.shots(entries, read), options.colour, pose_file=file)
 
 
-def _find(path: Path) -> Path | None:
-    return first_file(path, "reconstruction.json", "opensfm/reconstruction.json")
-
-
 def _camera(record: Record) -> Camera:
     """Return the camera, whose numbers are relative to the longer side and to the centre of the image."""
     width, height = record.size("width"), record.size("height")
@@ -102,7 +98,7 @@ def _camera(record: Record) -> Camera:
 reader = Format(
     "OpenSfM and OpenDroneMap: the largest reconstruction, with times, without depth",
     "images with reconstruction.json (OpenSfM, OpenDroneMap)",
-    _find,
+    lambda path: first_file(path, "reconstruction.json", "opensfm/reconstruction.json"),
     _read,
     ["images"],
     precedence=13,  # after LLFF, which is made from COLMAP's reconstruction

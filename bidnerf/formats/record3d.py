@@ -16,7 +16,6 @@ Members of the archive are read one at a time and within limits.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -64,7 +63,11 @@ def _read(path: Path, metadata_file: Path, options: DatasetOptions) -> Capture:
         import_extra("lzfse", "record3d", "reading depth of Record3D", path)
     elif (path / "depth").is_dir():
         warn_about(path / "depth", "depth in EXR files is not read; export the recording as .r3d to use its depth")
-    cameras, times, read_depth = _cameras(metadata, len(poses)), _times(metadata, len(poses)), lidar.LidarDepth()
+    stamps, fps = (metadata.items("frameTimestamps") or [])[: len(poses)], metadata.number("fps")
+    times: list[float | None] = [number / fps if fps else None for number in frames]
+    if len(stamps) == len(poses):
+        times = [metadata.checked_number(stamp, "an entry of frameTimestamps") for stamp in stamps]
+    cameras, read_depth = _cameras(metadata, len(poses)), lidar.LidarDepth()
     size, shots = (metadata.size("dw") or width, metadata.size("dh") or height), list[Shot]()
     for number, pose, depth in zip(frames, poses, depths, strict=True):
         where = f"{metadata.where}: pose {number}"
@@ -129,14 +132,6 @@ def _unpack(file: ImageSource, kind: str, size: tuple[int, int]) -> np.ndarray:
             f"unpacks to {len(content)} bytes", where=file, expected=f"{count} according to metadata (dw, dh)"
         )
     return np.frombuffer(content, kind).reshape(size[::-1])
-
-
-def _times(metadata: Record, count: int) -> Sequence[float | None]:
-    """Return the times of the frames, from the time stamps or from the frame rate."""
-    stamps, fps = metadata.items("frameTimestamps") or [], metadata.number("fps")
-    if len(stamps) >= count:
-        return [metadata.checked_number(stamp, "an entry of frameTimestamps") for stamp in stamps[:count]]
-    return [number / fps if fps else None for number in range(count)]
 
 
 def _cameras(metadata: Record, count: int) -> list[list[float]]:

@@ -22,7 +22,6 @@ or ``cameras.txt``, describes the colour images; without registration, it descri
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
@@ -72,9 +71,19 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
     number_of = {folder: int("".join(re.findall(r"\d+$", folder.name)) or -1) for folder in {i.parent for i in images}}
     splits = dict[int, tuple[str, ...]]()
     for split, file in (("train", path / "TrainSplit.txt"), ("test", path / "TestSplit.txt")):
-        if path not in number_of and file.is_file():
-            for number in _read_split(file, number_of.values()):
-                splits[number] = *splits.get(number, ()), split
+        if path in number_of or not file.is_file():
+            continue
+        rows = read_rows(file, "a list of sequences", "a sequence such as sequence1")
+        if not rows:
+            raise InputError("lists no sequences", where=file, expected="lines such as sequence1")
+        for row in rows:
+            match = re.fullmatch(r"seq(?:uence)?-?0*(\d+)", row.text, re.IGNORECASE)
+            if match is None:
+                raise row.error(f": {row.text[:40]!r}")
+            number = int(match[1])
+            if number not in number_of.values():
+                raise InputError(f"no folder for {row.text}", where=row.where, expected=f"seq-{number:02d}")
+            splits[number] = *splits.get(number, ()), split
     shots = list[Shot]()
     for image, shot in zip(images, SEVEN_SCENES.shots(images, camera, unit, sensor), strict=True):
         T, own = shot.T_world_camera, splits.get(number_of[image.parent], ())
@@ -88,21 +97,6 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
         depth_unit=unit,
         poses_expected="frame-000000.pose.txt",
     )
-
-
-def _read_split(file: Path, known: Collection[int]) -> list[int]:
-    """Return the numbers of the sequences in a split file. Raises ``InputError`` if it lists none or one that is not ``known``."""
-    numbers = list[int]()
-    for row in read_rows(file, "a list of sequences", "a sequence such as sequence1"):
-        match = re.fullmatch(r"seq(?:uence)?-?0*(\d+)", row.text, re.IGNORECASE)
-        if match is None:
-            raise row.error(f": {row.text[:40]!r}")
-        numbers.append(int(match[1]))
-        if numbers[-1] not in known:
-            raise InputError(f"no folder for {row.text}", where=row.where, expected=f"seq-{numbers[-1]:02d}")
-    if not numbers:
-        raise InputError("lists no sequences", where=file, expected="lines such as sequence1")
-    return numbers
 
 
 reader = Format(

@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from bidnerf.formats import lidar
+from bidnerf.formats.ace import read_matrix
 from bidnerf_core.datasets import (
     Capture,
     DatasetOptions,
@@ -26,8 +27,7 @@ from bidnerf_core.datasets import (
     pose_of_numbers,
     read_table,
 )
-from bidnerf_core.errors import InputError
-from bidnerf_core.io import is_file, read_rows
+from bidnerf_core.io import is_file
 
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 LENS = ("fx", "fy", "cx", "cy")
@@ -42,23 +42,18 @@ def _read(path: Path, odometry: Path, options: DatasetOptions) -> Capture:
     video, read, shots = Video(path / "rgb.mp4"), lidar.LidarDepth(), list[Shot]()
     columns = "timestamp, frame, x, y, z, qx, qy, qz, qw"
     rows = read_table(odometry, "Stray Scanner's odometry", columns, {"timestamp", "frame", *POSE_COLUMNS})
-    matrix, columns = path / "camera_matrix.csv", "3 rows of 3 numbers"
-    lines = read_rows(matrix, "Stray Scanner's camera matrix", columns)
-    numbers = [line.numbers(line.text.replace(",", " ").split(), 3) for line in lines]
-    if len(numbers) != 3:
-        raise InputError(f"has {len(numbers)} rows", where=matrix, expected=columns)
-    of_all = numbers[0][0], numbers[1][1], numbers[0][2], numbers[1][2]
+    of_all = read_matrix(path / "camera_matrix.csv", video.size)
     for row, words in rows:
         number = row.integer(words["frame"])
         own = row.plain_numbers([words[key] for key in LENS]) if all(map(words.get, LENS)) else None
-        where, stem = str(matrix) if own is None else row.where, f"{number:06d}"
+        stem = f"{number:06d}"
         pose = row.plain_numbers([words[name] or "nan" for name in POSE_COLUMNS])
         # The first versions wrote depth as .npy.
         depth = first_file(path / "depth", f"{stem}.png", f"{stem}.npy")
         shots.append(
             Shot(
                 image=VideoPicture(video, number) if number < len(video) else video.path / stem,
-                camera=camera_of(where, own or of_all, video.size),
+                camera=of_all if own is None else camera_of(row.where, own, video.size),
                 T_world_camera=pose_of_numbers(row.where, pose, opengl=False),
                 time=row.plain_numbers([words["timestamp"]])[0],
                 depth=None
@@ -81,14 +76,10 @@ def _read(path: Path, odometry: Path, options: DatasetOptions) -> Capture:
     )
 
 
-def _find(path: Path) -> Path | None:
-    return first_file(path, "odometry.csv") if is_file(path / "camera_matrix.csv") else None
-
-
 reader = Format(
     "Stray Scanner: depth of confidence 2 up to 5 m (extra 'video')",
     "rgb.mp4 with odometry.csv and camera_matrix.csv (Stray Scanner)",
-    _find,
+    lambda path: first_file(path, "odometry.csv") if is_file(path / "camera_matrix.csv") else None,
     _read,
     precedence=30,  # a recording with metric poses
 )

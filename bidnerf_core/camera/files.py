@@ -345,9 +345,7 @@ def parse_calibration(where: str, values: Mapping[str, Any], size: tuple[int, in
         K = np.array(((K[0], 0, K[2]), (0, K[1], K[3]), (0, 0, 1)))
     elif "intrinsic_matrix" in values and not isinstance(given, Mapping) and K.shape == (9,):  # by columns
         K = K.reshape(3, 3).T
-    pair = _first(values, "size")
-    if pair is None:
-        pair = [_first(values, key) or 0 for key in ("width", "height")]
+    pair = _first(values, "size") or [_first(values, key) or 0 for key in ("width", "height")]
     sides = _array(where, pair).ravel().astype(int).tolist()
     if len(sides) != 2:
         raise InputError(f"size is {str(pair)[:60]!r}", where=where, expected="width and height in pixels")

@@ -294,9 +294,9 @@ def colmap_camera(where: str, model: str, width: int, height: int, parameters: S
         if kind == PANORAMA:
             return PanoramaFace("front", (width, height))
         fx, fy, cx, cy, *rest = (0.0 if index < 0 else float(parameters[index]) for index in indices)
-        lens = tuple(rest) if any(rest) else ()
-        flat = Intrinsics(fx, fy, cx, cy, width, height, lens if kind == PERSPECTIVE else ())
-        return flat if kind == PERSPECTIVE else CentralLens(model, flat, tuple(rest))
+        if kind == PERSPECTIVE:
+            return Intrinsics(fx, fy, cx, cy, width, height, tuple(rest) if any(rest) else ())
+        return CentralLens(model, Intrinsics(fx, fy, cx, cy, width, height), tuple(rest))
 
 
 def colmap_model(camera: Camera) -> tuple[str, list[float]]:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from bidnerf_core.datasets.colmap_files import ModelImage, read_model
 from bidnerf_core.depth import nearest_depth
-from bidnerf_core.errors import InputError, errors_in
+from bidnerf_core.errors import InputError, enumeration, errors_in
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, fit_similarity, spread
 from bidnerf_core.settings import Above, Settings, WholeNumbers
@@ -53,8 +53,7 @@ class SparsePoints:
             parts = PurePosixPath(image.name.replace("\\", "/")).with_suffix("").parts
             for name in {"_".join(parts[-count:]) for count in range(1, len(parts) + 1)}:
                 self._images[name].append((parts[:-1], image))
-        listed = ", ".join([*(image.name for image in images[:3]), *(["..."] if len(images) > 3 else [])])
-        self._some = f"{len(images)} images" + (f" ({listed})" if listed else "")
+        self._some = f"{len(images)} images ({enumeration([image.name for image in images], 3) or 'none'})"
         points = self._points
         sound = points.positions.isfinite().all(-1) & ~points.errors.isnan()
         # A negative error was never computed and excludes no point.
@@ -65,8 +64,11 @@ class SparsePoints:
                 f" pixels or less and {choice.points_views} observations or more",
                 where=folder,
             )
-        pairs = [(self._image(name, split), T.translation) for name, T in places]
-        known = [(image.T_camera_model.inverse().translation, position) for image, position in pairs if image]
+        known = [
+            (placed.T_camera_model.inverse().translation, T.translation)
+            for name, T in places
+            if (placed := self._image(name, split))
+        ]
         if len(known) < 2:
             raise InputError(
                 f"has {len(known)} of the {len(places)} training cameras",

@@ -13,7 +13,7 @@ from bidnerf_core.datasets.capture import Capture
 from bidnerf_core.datasets.formats.photos import PhotoShot
 from bidnerf_core.datasets.options import AS_STORED
 from bidnerf_core.datasets.reader import DatasetOptions, file_of_dataset, no_dataset
-from bidnerf_core.errors import InputError, InputWarning, UsageError, amount
+from bidnerf_core.errors import InputError, InputWarning, UsageError, amount, enumeration
 from bidnerf_core.frames import DEPTH_STEM, Frame, View, photos_in
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import looks_like_image
@@ -180,11 +180,7 @@ def photo_files(paths: Sequence[Path], depth: Sequence[Path] = ()) -> list[Path]
         if not found:
             raise no_dataset(path)
         if others:
-            named = ", ".join(file.name for file in others[:5])
-            log.info(
-                f"{path}: skipped {named}{f' and {len(others) - 5} more' if len(others) > 5 else ''}: not photos by their"
-                " names"
-            )
+            log.info(f"{path}: skipped {enumeration([file.name for file in others], 5)}: not photos by their names")
         files += found
     return files
 

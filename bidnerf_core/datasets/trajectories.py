@@ -198,7 +198,11 @@ def read_trajectory(path: Path, times: Sequence[float] | None = None) -> Traject
         return Trajectory(torch.tensor(times, dtype=torch.float64), poses.rotation, poses.translation)
     comments = [line for line in content.decode("utf-8-sig", "replace").splitlines() if line.lstrip().startswith("#")]
     timed = _timed_rows(rows, path, POSE, any("[ns]" in line for line in comments))
-    order, known = _quaternion_order(comments, rows[0]), list[tuple[TimedRow, list[float]]]()
+    # The quaternion order is the one that a comment states, else that of EuRoC or TUM.
+    stated = ["".join(re.findall(r"\bq_?(?:\w+_)?([wxyz])\b", line, re.IGNORECASE)).lower() for line in comments]
+    stamp, known = _words(rows[0])[0], list[tuple[TimedRow, list[float]]]()
+    is_euroc = "," in rows[0].text and stamp.isdecimal() and int(stamp) >= LEAST_NANOSECONDS
+    order = next((named for named in stated if sorted(named) == sorted("xyzw")), "wxyz" if is_euroc else "xyzw")
     for row in timed:
         numbers = pose_numbers(row.row.where, row.row.plain_numbers(row.words[:7]), order)
         if numbers is not None:
@@ -216,17 +220,6 @@ def read_trajectory(path: Path, times: Sequence[float] | None = None) -> Traject
     values = torch.tensor([numbers for _, numbers in known], dtype=torch.float64)[torch.from_numpy(first)]
     rotations = torch.from_numpy(Rotation.from_quat(values[:, 3:].numpy()).as_matrix())
     return Trajectory(torch.from_numpy(stamps), rotations, values[:, :3])
-
-
-def _quaternion_order(comments: Sequence[str], first: Row) -> str:
-    """Return the quaternion order: the one stated in a comment, else that of EuRoC or TUM."""
-    for line in comments:
-        named = "".join(re.findall(r"\bq_?(?:\w+_)?([wxyz])\b", line, re.IGNORECASE)).lower()
-        if sorted(named) == sorted("xyzw"):
-            return named
-    stamp = _words(first)[0]
-    is_euroc = "," in first.text and stamp.isdecimal() and int(stamp) >= LEAST_NANOSECONDS
-    return "wxyz" if is_euroc else "xyzw"
 
 
 def pose_numbers(where: str, numbers: Sequence[float], order: str = "xyzw") -> list[float] | None:

@@ -99,7 +99,7 @@ def photos_below(folder: Path, out: Path | None = None) -> list[Path]:
     if unread:
         warn_about(
             folder,
-            f"{enumeration(unread[:3])}{f' and {len(unread) - 3} more' if len(unread) > 3 else ''}: usually poses, but in a format"
+            f"{enumeration(unread, 3)}: usually poses, but in a format"
             " that is not read; new ones are searched for, in a unit and a world of their own. Convert the poses to"
             " transforms.json to use them",
         )
@@ -135,8 +135,7 @@ def _without_copies(folder: Path, photos: Sequence[Path]) -> list[Path]:
         if copies and len(copies) < len(left):
             left[:] = [photo for photo in left if photo not in set(copies)]
             names = dict.fromkeys(str((c.parent if c.parent != folder else c).relative_to(folder)) for c in copies)
-            listed = enumeration([*list(names)[:4], *(["more"] if len(names) > 4 else [])])
-            warn_about(folder, f"{listed}: {what}, left out ({amount(len(copies), 'image')})")
+            warn_about(folder, f"{enumeration(list(names), 4)}: {what}, left out ({amount(len(copies), 'image')})")
 
     leave_out([photo for photo in left if _is_deep_grey(photo)], "grey images of 16 bits or more, such as depth")
     matches = [(photo, DERIVED.fullmatch(photo.stem)) for photo in left]

@@ -55,10 +55,6 @@ class Video:
     def __len__(self) -> int:
         return len(self.times)
 
-    def __iter__(self) -> Iterator[tuple[float, UInt8[np.ndarray, "h w 3"]]]:
-        """Yield the time (seconds) and the upright pixels of each frame. Raises ``InputError`` if the file is truncated."""
-        return ((time, self.pixels(number, is_upright=True)) for number, time in enumerate(self.times))
-
     def pixels(self, number: int, is_upright: bool = False) -> UInt8[np.ndarray, "h w 3"]:
         """Return the pixels of a frame, as stored or rotated upright according to the metadata.
 

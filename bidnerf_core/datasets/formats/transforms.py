@@ -113,19 +113,18 @@ def _camera(frame: FrameRecord, size: tuple[int, int] | None) -> Camera | Camera
 
 def _first_size(frames: Sequence[FrameRecord], images: Sequence[Path]) -> tuple[int, int] | None:
     """Return the size of the first readable image. If its camera has another size, a remark states that cameras are scaled."""
-    for frame, image in zip(frames, images, strict=True):
-        size, _ = _header(image)
-        if size is None:
-            continue
-        given = frame.record.size("w") or size[0], frame.record.size("h") or size[1]
-        if given != size and same_aspect(given, size):
-            warn_about(
-                frame.record.where,
-                f"{image.name} is {size[0]}x{size[1]}, but w and h are {given[0]}x{given[1]}; cameras are scaled to the"
-                " images",
-            )
-        return size
-    return None
+    sized = ((frame, image, _header(image)[0]) for frame, image in zip(frames, images, strict=True))
+    frame, image, size = next((each for each in sized if each[2] is not None), (None, None, None))
+    if frame is None or image is None or size is None:
+        return None
+    given = frame.record.size("w") or size[0], frame.record.size("h") or size[1]
+    if given != size and same_aspect(given, size):
+        warn_about(
+            frame.record.where,
+            f"{image.name} is {size[0]}x{size[1]}, but w and h are {given[0]}x{given[1]}; cameras are scaled to the"
+            " images",
+        )
+    return size
 
 
 def _header(image: Path) -> tuple[tuple[int, int] | None, bool]:
