@@ -363,7 +363,7 @@ def test_checkpoints_of_gsplat_and_splatfacto(tmp_path: Path, some: Some) -> Non
     for broken, message in (
         ({"sh0": torch.zeros(7)}, "different counts"),
         ({"means": torch.tensor(1.0)}, "different counts"),
-        (repeated, "has only"),
+        (repeated, "unpacks to"),
     ):
         torch.save({"splats": gsplat | broken}, tmp_path / "a.pt")
         with pytest.raises(InputError, match=message):

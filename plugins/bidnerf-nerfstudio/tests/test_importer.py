@@ -161,7 +161,7 @@ def test_damaged_checkpoints(run_of: RunOf) -> None:
         ("field.mlp_head.layers.1.weight", torch.zeros(16, 15), "expected (16, 16)"),
         ("field.mlp_head.layers.1.bias", torch.full((16,), torch.nan), "finite numbers"),
         ("field.mlp_base.model.0.hash_table", torch.zeros(100, 2), "has 100 rows, expected 4 tables"),
-        ("field.mlp_base.model.0.hash_table", torch.zeros(1).expand(2**30, 2), "has only"),
+        ("field.mlp_base.model.0.hash_table", torch.zeros(1).expand(2**30, 2), "unpacks to"),
         ("field.log2_hashmap_size", torch.tensor(60), "expected 4 tables of 2 to the power of 60"),
         ("field.aabb", torch.zeros(6), "expected (2, 3)"),
         ("field.aabb", torch.zeros(2, 3), "is empty"),
