@@ -86,7 +86,7 @@ def test_a_damaged_file_is_refused_in_one_line_or_read(kind: str, sound: Path, t
     (file,) = copy.glob(pattern)
     count = Counter[bool]()
 
-    @settings(max_examples=15)
+    @settings(max_examples=20)
     @given(damaged=draw_damage(damages(file.read_bytes())))
     def judged(damaged: tuple[str, bytes]) -> None:
         file.write_bytes(damaged[1])
