@@ -178,9 +178,7 @@ def test_stored_cameras_have_both_poses_the_distance_between_them_and_the_motion
 def test_training_gets_the_motions(monkeypatch: pytest.MonkeyPatch) -> None:
     points, views, _ = moving(1.0, 0.004)
     monkeypatch.setattr(
-        training_views,
-        "track_views",
-        lambda given, features: track_views(given, points),
+        training_views, "track_views", lambda given, _, **options: track_views(given, points, **options)
     )
     found = training_views.prepare_views(views)
     moved = [view.motion is not None and bool(view.motion.any()) for view in found.views]
