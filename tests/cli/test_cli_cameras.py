@@ -93,11 +93,3 @@ def test_trials_record_the_camera_and_are_resumed_by_it(
     other = bidnerf(*words, "--depth-unit", 0.001).succeed()
     assert "already there" not in other.err
     assert out.read_text().count("\n") == 2
-
-
-def test_options_of_datasets_need_one(bidnerf: Run, shared: Path, given: Path, tmp_path: Path) -> None:
-    photo = next((given / "data" / "rgb").iterdir())
-    found = bidnerf("extend", shared / "map", photo, "--camera", given / "camera.json")
-    assert_refused(found, 2, "--camera", photo)
-    words = ["evaluate", "demo:blobs", "--out", tmp_path / "r.jsonl", "--depth-unit", 0.001]
-    assert_refused(bidnerf(*words), 1, "leave out --depth-unit")

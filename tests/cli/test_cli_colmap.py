@@ -18,15 +18,10 @@ QUICK = ["--method", "bid", "--perturb", "0.1", "5", "--max-steps", "3", "--rays
 
 @pytest.fixture(scope="module")
 def given(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """``data`` without depth, models of its images: ``sparse`` of all, ``training`` of those of the map, ``strangers``."""
-    folder = tmp_path_factory.mktemp("colmap")
-    dense = open_dataset(shared / "data")
-    train, test = dense.views("train"), dense.views("test")
-    models = {"sparse": [*train, *test], "training": train, "strangers": train}
-    for name, views in models.items():
-        prefix = "x" if name == "strangers" else ""
-        files = [f"{prefix}{view.frame.name}.png" for view in views]
-        sparse_model.write(folder / name, sparse_model.known(views, files))
+    """``data`` without depth, and a model of its images, ``sparse``."""
+    folder, views = tmp_path_factory.mktemp("colmap"), open_dataset(shared / "data").views("all")
+    files = [f"{view.frame.name}.png" for view in views]
+    sparse_model.write(folder / "sparse", sparse_model.known(views, files))
     tiny.write_dataset(folder / "data", depth=False)
     return folder
 

@@ -54,7 +54,7 @@ from bidnerf_core.camera import WAYS
 from bidnerf_core.localization import settings_of
 from bidnerf_core.registry import _declared
 from bombs import png_of
-from commands import Run, assert_refused
+from commands import Run
 from waiting import wait_until
 
 QUICK = {"max_steps": 3, "rays": 64}
@@ -832,8 +832,3 @@ def test_startup_of_another_server_starts_the_pool(monkeypatch: pytest.MonkeyPat
     answers = [call.args[0]["type"] for call in send.await_args_list]
     assert answers == ["lifespan.startup.complete", "lifespan.shutdown.complete"]
     assert (start.await_count, close.await_count) == (1, 1)
-
-
-def test_a_folder_without_a_map_is_refused(inputs: Inputs, bidnerf: Run) -> None:
-    """The process that would hold the maps refuses it, and the command prints its line."""
-    assert_refused(bidnerf("serve", inputs.folder / "data"), 1, inputs.folder / "data", "no map.json")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, make_dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -178,37 +178,12 @@ def untrained(backend: Any) -> Any:
     return backend
 
 
-@dataclass
-class Melted:
-    steps: int = 3
+def config(name: str, *fields: Any, frozen: bool = True) -> Any:
+    """A backend whose config has these fields: names, types and perhaps defaults."""
+    return with_members(config_type=make_dataclass(name, fields, frozen=frozen))
 
 
-@dataclass(frozen=True)
-class Bare:
-    size: int
-    steps: int = 3
-
-
-@dataclass(frozen=True)
-class Endless:
-    size: int = 3
-
-
-@dataclass(frozen=True)
-class Halves:
-    steps: float = 3.5
-
-
-@dataclass(frozen=True)
-class Unwritable:
-    steps: int = 3
-    device: Any = field(default_factory=lambda: torch.device("cpu"))
-
-
-@dataclass(frozen=True)
-class Forgetful:
-    steps: int = 3
-    values: Any = (1, 2)  # comes back as a list
+STEPS = ("steps", int, 3)
 
 
 class Doubling(torch.autograd.Function):
@@ -427,12 +402,16 @@ BREAKS: list[tuple[str, Any, str]] = [
     (SAYS, object(), "lacks some of summary, config_type, build, train"),
     *((SAYS, with_members(summary=text), "expected one line of text") for text in ("", "two\nlines", 3)),
     (CONFIG, with_members(config_type=dict), "config_type is <class 'dict'>, expected a frozen dataclass"),
-    (CONFIG, with_members(config_type=Melted), "Melted'>, expected a frozen dataclass"),
-    (CONFIG, with_members(config_type=Bare), "no default for size"),
-    (CONFIG, with_members(config_type=Endless), "steps = None"),
-    (CONFIG, with_members(config_type=Halves), "steps = 3.5"),
-    (JSON, with_members(config_type=Unwritable), "config.device is a device"),
-    (JSON, with_members(config_type=Forgetful), "comes back from JSON"),
+    (CONFIG, config("Melted", STEPS, frozen=False), "Melted'>, expected a frozen dataclass"),
+    (CONFIG, config("Bare", ("size", int), STEPS), "no default for size"),
+    (CONFIG, config("Endless", ("size", int, 3)), "steps = None"),
+    (CONFIG, config("Halves", ("steps", float, 3.5)), "steps = 3.5"),
+    (
+        JSON,
+        config("Unwritable", STEPS, ("device", Any, field(default=torch.device("cpu")))),
+        "config.device is a device",
+    ),
+    (JSON, config("Forgetful", STEPS, ("values", Any, (1, 2))), "comes back from JSON"),
     (BUILD, with_members(build=lambda self, config, bounds: object()), "expected an nn.Module"),
     (BUILD, with_members(build=lambda self, config, bounds: nn.Linear(3, 4)), "without query or sampler"),
     (
