@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
-from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from unittest.mock import Mock
 
 import imageio.v3 as iio
 import pytest
@@ -154,37 +153,23 @@ def test_maps_are_named_once(data: Path) -> None:
         compare([], data)
 
 
-class Ending(InThisProcess):
-    """A process that ends with its first call."""
-
-    def submit(self, *_: object, **__: object) -> Future[Any]:  # type: ignore[override]
-        future = Future[Any]()
-        future.set_exception(BrokenProcessPool())
-        return future
-
-
 def test_a_process_that_ends_is_told_in_one_line(
     maps: list[Path], data: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bidnerf.evaluation.comparison.local_processes", lambda count: Ending())
+    monkeypatch.setattr(InThisProcess, "submit", Mock(side_effect=BrokenProcessPool()))
+    monkeypatch.setattr("bidnerf.evaluation.comparison.local_processes", lambda count: InThisProcess())
     with refused(where=maps[0], found="frame t_0002 ended", expected="memory"):
         compare([maps[0]], data, plan)
 
 
 def test_a_failure_ends_the_processes_with_their_trials() -> None:
-    class Process:
-        ended = False
-
-        def terminate(self) -> None:
-            self.ended = True
-
     for failure in (LookupError, None):
-        pool, process = InThisProcess(), Process()
+        pool, process = InThisProcess(), Mock()
         vars(pool)["_processes"] = {7: process}
         with suppress(LookupError), terminate_on_failure(pool):
             if failure is not None:
                 raise failure
-        assert process.ended == (failure is not None)
+        assert process.terminate.called == (failure is not None)
 
 
 def test_the_picture_is_written(compared: Comparison, tmp_path: Path) -> None:

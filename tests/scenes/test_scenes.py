@@ -11,7 +11,6 @@ from torch import Tensor
 
 from bidnerf.scenes import ClosedFormScene, demo_object, demo_room, look_around, orbit, views
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.fields import SceneBounds
 from bidnerf_core.geometry import SE3, look_at
 from optional import require
 
@@ -163,5 +162,4 @@ def test_pictures_are_upright_and_not_mirrored() -> None:
 
 def test_bounds_of_scenes_have_room_for_a_camera() -> None:
     for scene in SCENES:
-        assert isinstance(scene.bounds, SceneBounds)
         assert math.hypot(*scene.bounds.size) <= scene.bounds.far
