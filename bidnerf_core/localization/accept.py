@@ -100,10 +100,22 @@ class Bound(NamedTuple):
 
 
 LANDMARK_BOUNDS = (
-    Bound("log10_nfa", -12.0, False, Outcome.TOO_FEW_MATCHES, "{0:.0e} poses as good are expected by chance"),
-    Bound("inliers", 15, True, Outcome.TOO_FEW_MATCHES, "only {0:.0f} landmark inliers", True, 10),
+    Bound(
+        "log10_nfa",
+        -12.0,
+        False,
+        Outcome.TOO_FEW_MATCHES,
+        "so few matches agree that chance alone would give {0:.0e} such poses, accepted are at most {1:.0e}",
+    ),
+    Bound("inliers", 15, True, Outcome.TOO_FEW_MATCHES, "only {0:.0f} landmark inliers, expected {1:g}", True, 10),
     Bound("mirrored", 0, False, Outcome.MIRRORED, "the mirror image fits the map better than the image", True),
-    Bound("above_chance", 3.0, True, Outcome.AMBIGUOUS, "only {0:.1f} times as many landmarks match as by chance"),
+    Bound(
+        "above_chance",
+        3.0,
+        True,
+        Outcome.AMBIGUOUS,
+        "only {0:.1f} times as many landmarks match as by chance, expected {1:g} times",
+    ),
     Bound("spread", 0.06, True, Outcome.UNDETERMINED, "the landmarks are all in {0:.0%} of the image"),
     Bound("other_place", 0.02, False, Outcome.AMBIGUOUS, "another place fits with a probability of {0:.0%}", True),
     Bound(
@@ -111,7 +123,7 @@ LANDMARK_BOUNDS = (
         0.5,
         True,
         Outcome.MISCALIBRATED,
-        "the image contradicts the intrinsics: they are right with {0:.0%}",
+        "the image contradicts the stated intrinsics, which are right with a probability of {0:.0%}",
     ),
     Bound("precision", 0.03, False, Outcome.IMPRECISE, "the position is uncertain by {0:.1%} of the distance", True),
     # On record (``answers_halves``: four maps of each of six scenes, with and without faults), 487 answers are accepted, 14 of which are
@@ -136,8 +148,8 @@ def judge(evidence: Evidence, log_odds: float = 0.0) -> Verdict:
     """
     confidence = model().probability(features(evidence), log_odds)
     for bound, value in evidence.violated:
-        shown = 10.0 ** min(max(value, -300), 300) if bound.measure == "log10_nfa" else value
-        return Verdict(bound.outcome, bound.reason.format(shown), confidence)
+        shown = [10.0 ** min(max(x, -300), 300) if bound.measure == "log10_nfa" else x for x in (value, bound.limit)]
+        return Verdict(bound.outcome, bound.reason.format(*shown), confidence)
     share = f"{evidence.inliers} landmark inliers"
     if confidence < ACCEPTED:
         why = f"{share}, but only {math.floor(100 * confidence)}% likely to be right"
