@@ -1,7 +1,7 @@
 r"""Answers on record: what the localizer says to the same images, before and after a change of its code.
 
     python benchmarks/answer_maps.py MAP [MAP ...]
-    python benchmarks/answers.py MAP [MAP ...] --out A.jsonl [--share 0.1] [--unchanged]
+    python benchmarks/answers.py MAP [MAP ...] --out A.jsonl [--share 0.1] [--only CONDITION ...]
     python benchmarks/answers.py --compare A.jsonl [B.jsonl]
     python benchmarks/answers.py --record A.jsonl [A2.jsonl ...] [--name answers]
 
@@ -11,8 +11,8 @@ start and on one thread, with depth and without, under the conditions that the t
 as a row with its pose, covariance (upper triangle, single precision), outcome, reason, confidence, errors and CPU time. The
 same code gives the same rows on the same maps, to the bit, but for the time. An interrupted run resumes; several may run at a
 time on different maps, each with its own file. All conditions advance alike, so that an unfinished run covers each of them.
-``--share`` takes a part of the images, evenly spaced; ``--unchanged`` takes all images of the test split, those for tuning
-included, as they are.
+``--share`` takes a part of the images, evenly spaced; ``--only`` takes all images of the test split, those for tuning
+included, under the named conditions alone, such as "as it is" or "other scene".
 
 Of the frames of a test split, those for tuning are left out if at least 15 others remain. Images of other scenes, of a bare
 wall, and of a scene that stands twice have no right answer. Right for the average of two photos is the pose of either; right
@@ -328,14 +328,14 @@ class Subject:
         data, frame = self.foreign.get(name, (self.scene.dataset, name))
         return data.views("test", [frame])[0]
 
-    def plan(self, share: float, unchanged: bool) -> Iterator[tuple[float, str, str, str]]:
+    def plan(self, share: float, only: Sequence[str]) -> Iterator[tuple[float, str, str, str]]:
         """Yield for each question how far down its condition's list it stands, mode, condition, and frame."""
         every = self.scene.dataset.frame_names("test")
         for condition, how in CONDITIONS.items():
-            if condition == "plane" or (unchanged and condition != "as it is"):
+            if condition == "plane" or (only and condition not in only):
                 continue
-            names = list(self.foreign) if condition == "other scene" else every if unchanged else self.frames
-            taken = spread(names, len(every) if unchanged else round(FRAMES * how.share))
+            names = list(self.foreign) if condition == "other scene" else every if only else self.frames
+            taken = spread(names, len(names) if only else round(FRAMES * how.share))
             taken = spread(taken, max(1, round(share * len(taken))))
             for place, name in enumerate(taken):
                 has_depth = self.view(name).frame.has_depth
@@ -344,10 +344,10 @@ class Subject:
                         yield (place + 0.5) / len(taken), mode, condition, name
 
     def questions(
-        self, share: float, unchanged: bool
+        self, share: float, only: Sequence[str]
     ) -> Iterator[tuple[tuple[str, str, str, str], Callable[[], Question]]]:
         """Yield keys and how to make their questions, so that all conditions advance alike."""
-        for _, mode, condition, name in sorted(self.plan(share, unchanged), key=lambda some: some[0]):
+        for _, mode, condition, name in sorted(self.plan(share, only), key=lambda some: some[0]):
             key = (self.name, mode, condition, name)
             yield key, lambda key=key: self.question(key)  # type: ignore[misc]
 
@@ -409,12 +409,12 @@ class Planes:
             self._questions.append((key, lambda asked=asked: asked))  # type: ignore[misc]
 
     def questions(
-        self, share: float, unchanged: bool
+        self, share: float, only: Sequence[str]
     ) -> Iterator[tuple[tuple[str, str, str, str], Callable[[], Question]]]:
         yield from self._questions[:: max(1, round(1 / share))]
 
 
-def run(names: Sequence[str], out: Path, share: float, unchanged: bool) -> None:
+def run(names: Sequence[str], out: Path, share: float, only: Sequence[str]) -> None:
     """Ask all questions to which the file holds no answer yet."""
     with RowStore(out) as store:
         for name in names:
@@ -425,7 +425,7 @@ def run(names: Sequence[str], out: Path, share: float, unchanged: bool) -> None:
                     f"{out}: has answers of another map of {name}, {about['content']}, expected those of"
                     f" {subject.content}; name another --out"
                 )
-            for key, question in subject.questions(share, unchanged):
+            for key, question in subject.questions(share, only):
                 store.get(list(key), lambda question=question: question().answer())  # type: ignore[misc]
             print(f"{name}: done", flush=True)
 
@@ -590,7 +590,7 @@ def main() -> None:
     found.add_argument("maps", nargs="*", metavar="MAP", help=f"name of a dataset, or {PLANES}")
     found.add_argument("--out", type=Path, metavar="JSONL", help="file of the rows")
     found.add_argument("--share", type=float, default=1.0, help="part of the images (default: %(default)s)")
-    found.add_argument("--unchanged", action="store_true", help="take all images of the test split as they are")
+    found.add_argument("--only", nargs="+", default=(), choices=CONDITIONS, metavar="CONDITION", help="conditions")
     found.add_argument("--compare", nargs="+", type=Path, metavar="ROWS", help="one or two files of rows")
     found.add_argument("--record", nargs="+", type=Path, metavar="ROWS", help="files of rows to join")
     found.add_argument("--name", default="answers", help="of the record (default: %(default)s)")
@@ -607,7 +607,7 @@ def main() -> None:
         if given.out is None or not 0 < given.share <= 1:
             found.error("expected --out FILE for the rows of maps, and a --share above 0 and up to 1")
         one_thread()
-        run(given.maps, given.out, given.share, given.unchanged)
+        run(given.maps, given.out, given.share, given.only)
 
 
 if __name__ == "__main__":
