@@ -76,8 +76,10 @@ def _on_surface(
     # If the map's own images usually have 150 matches, an image without recognised landmarks shows something else.
     if surface is None or (loop is not None and loop.landmarks.usual_matches >= 150):
         return best or unrecognized(problem)
-    found = localize_by_depth(problem, surface, config if loop is None else replace(config, rounds=1), seed)
-    if found is None and loop is None:
+    config = config if loop is None else replace(config, rounds=1)
+    found = localize_by_depth(problem, surface, config, seed)
+    # Images take longer than points to search; in a map whose own images were all recognised, landmarks suffice.
+    if found is None and (loop is None or loop.landmarks.trial.found < loop.landmarks.trial.images):
         found = localize_by_images(problem, surface, config, seed)
     if found is None:
         return best or unrecognized(problem)

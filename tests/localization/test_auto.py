@@ -20,9 +20,11 @@ from bidnerf_bid import AdamSettings, BidConfig, DescentSettings
 from bidnerf_core.fields import Observations
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3, perturb
-from bidnerf_core.localization import METHODS, AutoConfig, Localization, Outcome, Problem, rig
+from bidnerf_core.localization import METHODS, AutoConfig, LandmarkMatcher, Localization, Outcome, Problem, rig
+from bidnerf_core.mapping import HeldOutTrial, Keypoints, SurfaceMap
 from bidnerf_core.registry import list_plugins, registered
-from localizations import assert_covered, assert_near, colour_only
+from conditions import point_landmarks
+from localizations import answer, assert_covered, assert_near, colour_only
 from problems import FieldMap, localize
 from refusals import refused
 from tiny import depth_rays_of
@@ -202,3 +204,23 @@ def test_what_looks_the_same_from_two_sides_is_ambiguous() -> None:
     surface, (view,) = baked.baked(scene), baked.images(scene, 1, seed=5)
     found = found_for(baked.problem(view, surface=surface))
     assert found.outcome is Outcome.AMBIGUOUS, found.reason
+
+
+@pytest.mark.parametrize(("recognised", "searched"), [(8, False), (6, True)])
+def test_images_are_searched_in_a_map_that_missed_some_of_its_own(
+    recognised: int, searched: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nothing = Keypoints(torch.zeros((0, 2)), torch.zeros(0), torch.zeros((0, 64), dtype=torch.uint8))
+    monkeypatch.setitem(registered, ("features", "points"), lambda rgb: nothing)
+    trial = HeldOutTrial(images=8, found=recognised)
+    landmarks = replace(point_landmarks(), features="points", trial=trial, usual_matches=20.0)
+    searches = list[int]()
+
+    def search(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int) -> Localization:
+        searches.append(config.rounds)
+        return answer()
+
+    monkeypatch.setattr(import_module("bidnerf_core.localization.auto"), "localize_by_images", search)
+    problem = replace(baked.problem(baked.unseen()[0]).without_depth(), matcher=LandmarkMatcher(landmarks))
+    assert found_for(problem).converged is searched
+    assert searches == [1] * searched
