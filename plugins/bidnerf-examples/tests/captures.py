@@ -20,7 +20,6 @@ def write_capture(folder: Path) -> Path:
         table = csv.writer(opened)
         for number, view in enumerate(training_views()):
             pose, name, depth = view.T_ref_camera, f"image{number:02d}", view.frame.depth
-            assert depth is not None
             table.writerow([name, 0.1 * number, *pose.matrix()[:3].flatten().tolist()])
             iio.imwrite(folder / f"{name}.png", (255 * view.frame.rgb).round().byte().numpy())
             millimetres = (1000 * depth).round().numpy().astype(np.uint16)

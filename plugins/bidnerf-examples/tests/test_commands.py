@@ -23,7 +23,6 @@ def trained(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_map_is_of_the_readers_images_and_the_detectors_landmarks(trained: Path) -> None:
     scene = load_map(trained)
     assert scene.info.landmark_features == "orb"
-    assert scene.landmarks is not None
     assert scene.landmarks.descriptors.shape[1] == 256
     assert [camera.name for camera in scene.info.cameras][:2] == ["image00", "image01"]
 

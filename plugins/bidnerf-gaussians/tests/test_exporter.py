@@ -49,7 +49,6 @@ def test_a_surface_is_as_opaque_and_as_far_away_as_splat(scene: Map, tmp_path: P
 def test_discs_lie_in_the_surface(scene: Map, tmp_path: Path) -> None:
     export_map(scene, tmp_path / "out", "splat.ply")
     found = read_gaussians(tmp_path / "out" / "splat.ply")
-    assert scene.surface is not None
     surfels = scene.surface.surfels
     assert torch.equal(found.means, surfels.positions)
     axes = matrices(found.quaternions)

@@ -66,7 +66,6 @@ def test_the_correction_belongs_to_the_odometry_of_the_image() -> None:
     assert (found.stamp.sec, found.stamp.nanosec) == (1, 0)
     bridge.close()
     correction = bridge.T_map_odom
-    assert correction is not None
     assert torch.allclose((correction @ T_odom_camera).matrix(), POSE.matrix())
 
 

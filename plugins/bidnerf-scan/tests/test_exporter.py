@@ -92,9 +92,6 @@ def test_the_importer_reads_the_mesh_in_the_frame_and_unit_of_the_map(scene: Map
     scan = read_scan(files[f"mesh.{ending}"])
     pose = files.get("T_world_file.json")
     T = SE3.identity() if pose is None else read_pose(pose)
-    assert scene.surface is not None
-    assert scan.rgb is not None
-    assert scan.faces is not None
     points = T.apply(torch.from_numpy(scan.points)).float()
     assert float(scene.surface.distance(points).max()) < 3 * scene.surface.cell
     nearest = scene.surface.nearest(points)

@@ -29,8 +29,6 @@ def test_meshes_with_colours(tmp_path: Path) -> None:
         tetrahedron().export(path)
         assert importer.recognises(path)
         scan = read_scan(path)
-        assert scan.faces is not None
-        assert scan.rgb is not None
         assert np.allclose(scan.points[scan.faces], CORNERS[FACES], atol=1e-6)
         assert np.allclose(scan.rgb[scan.faces], BYTES[FACES][..., :3] / 255, atol=2e-3)
 
@@ -84,7 +82,6 @@ def test_a_gltf_is_placed_by_its_nodes(tmp_path: Path) -> None:
         scene.add_geometry(tetrahedron(), transform=trimesh.transformations.translation_matrix([number, 0, 0]))
     scene.export(tmp_path / "two.glb")
     scan = read_scan(tmp_path / "two.glb")
-    assert scan.faces is not None
     assert len(scan.faces) == 8
     assert scan.points.max(0) == pytest.approx([2, 2, 3])
 
@@ -175,7 +172,6 @@ def test_dark_colours_of_16_bits_stay_dark(tmp_path: Path) -> None:
     rows = ["0 0 0 255 128 0", "1 0 0 0 0 0", "0 1 0 0 0 0"]
     (tmp_path / "dark.ply").write_text("\n".join([*head, *rows, ""]))
     rgb = read_scan(tmp_path / "dark.ply").rgb
-    assert rgb is not None
     assert np.allclose(rgb, np.array([[255, 128, 0], [0, 0, 0], [0, 0, 0]]) / 65535, atol=1e-7)
 
 
@@ -198,7 +194,6 @@ def test_surveyors_formats(tmp_path: Path) -> None:
     for name in ("a.las", "a.e57"):
         scan = read_scan(tmp_path / name)
         assert np.allclose(scan.points, points, atol=1e-3), name
-        assert scan.rgb is not None
         assert np.allclose(scan.rgb, np.eye(3), atol=1e-6), name
         (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:-40])
         with pytest.raises(InputError, match=name):

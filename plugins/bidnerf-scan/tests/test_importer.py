@@ -129,10 +129,8 @@ def test_the_surface_of_a_map_is_that_of_the_scan() -> None:
     """All of it, to within a cell, whether or not a viewpoint sees it."""
     mesh = box()
     found = imported(Scan(np.asarray(mesh.vertices), None, np.asarray(mesh.faces)), "x")
-    assert found.surface is not None
     surface = surface_of_points(*found.surface, found.bounds, [])
     away = (surface.surfels.positions.abs() - torch.tensor([0.5, 0.6, 0.4])).amax(-1)
     assert float(away.abs().max()) < 2 * surface.cell
     again = imported(Scan(np.asarray(mesh.subdivide().vertices)), "x").surface  # other points on all faces
-    assert again is not None
     assert float(surface.distance(again[0]).max()) < 5 * surface.cell

@@ -108,7 +108,6 @@ def every_view(dataset: Capture) -> dict[str, View]:
 def edge_error(view: View) -> float:
     """Return the share of pixels that have another colour than the point of the wall that their depth gives."""
     frame = view.frame
-    assert frame.depth is not None
     rays = frame.intrinsics.unproject(frame.intrinsics.pixel_centres(torch.float64))
     depth = (WALL - view.T_ref_camera.translation[2]) / view.T_ref_camera.rotate(rays)[..., 2]
     world = view.T_ref_camera.apply(rays * depth[..., None])
@@ -154,7 +153,6 @@ def test_poses_have_opencv_axes(scan: Path) -> None:
 def test_only_sure_depth_within_range_is_kept(scan: Path) -> None:
     (view,) = open_dataset(scan).views("test")
     depth = view.frame.depth
-    assert depth is not None
     dropped = depth.reshape(SMALL[1], 10, SMALL[0], 10).eq(0).all(3).all(1)
     assert dropped.nonzero().tolist() == [[0, 0], [10, 20], [11, 20]]
     assert int((depth == 0).sum()) == 300
@@ -320,16 +318,13 @@ def test_the_sequence_has_the_depth_between_photos(scan: Path) -> None:
     assert [timed.frame.has_colour for timed in frames] == [True, True, False, True, True]
     views = every_view(open_dataset(scan))
     for number, timed in enumerate(frames):
-        assert timed.truth is not None
         expected = pose_of(number)[:3, 3]
         np.testing.assert_allclose(timed.truth.translation, expected, atol=1e-12)
         if timed.frame.has_colour:
             assert torch.equal(timed.frame.rgb, views[timed.frame.name].frame.rgb)
     between = frames[2].frame
     assert (between.intrinsics.width, between.intrinsics.height) == SMALL
-    assert between.depth is not None
     rays = between.intrinsics.unproject(between.intrinsics.pixel_centres(torch.float64))
-    assert frames[2].truth is not None
     world = frames[2].truth.apply(rays * between.depth.double()[..., None])
     on_wall = between.depth > 0
     assert float(on_wall.float().mean()) > 0.99

@@ -125,7 +125,6 @@ def test_an_image_is_found_in_a_map_of_others() -> None:
     assert landmarks.features == "xfeat"
     query = view(9)
     found = Loop([View(query.frame, SE3.identity())], LandmarkMatcher(landmarks))()
-    assert found is not None
     error = pose_error(found.T_world_rig, query.T_ref_camera)
     assert float(error.translation) < 0.06  # at a distance of 2.7
     assert float(error.rotation_deg) < 1
