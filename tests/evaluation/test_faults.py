@@ -307,11 +307,8 @@ def test_a_crop_keeps_a_corner_and_the_offset_of_the_principal_point(view: View)
         assert any(torch.equal(frame.rgb, part) for part in parts)
         offset = frame.intrinsics.cx - width / 2, frame.intrinsics.cy - height / 2
         assert offset == (own.cx - own.width / 2, own.cy - own.height / 2)
-
-
-def test_of_the_smallest_image_a_crop_leaves_a_pixel() -> None:
-    tiny = plain(camera=Intrinsics(1.0, 1.0, 0.5, 0.5, 2, 1))
-    assert faulty(tiny, "crop:0.9", 0).frame.rgb.shape == (1, 1, 3)
+    smallest = plain(camera=Intrinsics(1.0, 1.0, 0.5, 0.5, 2, 1))
+    assert faulty(smallest, "crop:0.9", 0).frame.rgb.shape == (1, 1, 3)
 
 
 @pytest.mark.parametrize("k1", [0.3, -0.1])

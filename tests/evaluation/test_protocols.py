@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.stats import kstest
 
-from bidnerf.evaluation import PROTOCOLS, find_protocol
+from bidnerf.evaluation import PROTOCOLS
 
 # Inside: distributions of many starts, which trials draw one at a time
 from bidnerf.evaluation.plan import inerf_start
@@ -67,10 +67,3 @@ def test_inerf_fills_its_ranges_evenly() -> None:
         assert kstest(moves[:, axis].numpy(), "uniform", (-0.2, 0.4)).pvalue > 0.01
     assert kstest(angles.numpy(), "uniform", (0, 40)).pvalue > 0.01
     assert starts.log()[:, 3:].mean(0).abs().max() < 0.05  # rad
-
-
-def test_an_unknown_name_is_told_its_neighbour() -> None:
-    with refused(found="no protocol 'inerv', did you mean 'inerf'?"):
-        find_protocol("inerv")
-    with refused(found="no protocol 'xyz'", expected="one of bid, bid-hard"):
-        find_protocol("xyz")

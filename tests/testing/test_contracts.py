@@ -65,10 +65,6 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_plugins_are_a_mapping() -> None:
-    assert len(FAULTS) == len(list(FAULTS)) > 20
-
-
 @pytest.mark.parametrize("name", FAULTS)
 def test_every_bundled_fault_fulfils_the_contract(name: str) -> None:
     assert_fulfilled(FaultContract, name=name)
