@@ -125,8 +125,6 @@ def test_transparent_gaussians_are_not_met(some: Callable[..., Gaussians]) -> No
 
 
 def test_harmonics_are_orthonormal() -> None:
-    from bidnerf_gaussians.spherical_harmonics import basis
-
     directions = torch.nn.functional.normalize(
         torch.randn((200_000, 3), generator=torch.Generator().manual_seed(0), dtype=torch.float64), dim=-1
     )

@@ -213,11 +213,6 @@ def square_depth(folder: Path) -> None:
     write_confidence(folder, 2, (9, 9))
 
 
-def remove_photos(folder: Path) -> None:
-    for photo in folder.glob("*.jpg"):
-        photo.unlink()
-
-
 BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no json": (lambda f: (f / "frame_2.json").unlink(), r"frame_2\.json: no such file"),
     "no depth": (lambda f: (f / "depth_2.png").unlink(), r"depth_2\.png: no such file"),
@@ -283,7 +278,10 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
         lambda f: rewrite(f, lambda c: c.update(projectionMatrix=None), "5"),
         r"frame_5\.json: no projectionMatrix, expected 16 numbers",
     ),
-    "no photos": (remove_photos, r"scan: has frame_N.json but no photo"),
+    "no photos": (
+        lambda f: [photo.unlink() for photo in f.glob("*.jpg")],
+        r"scan: has frame_N.json but no photo",
+    ),
     "number twice": (
         lambda f: (f / "frame_02.jpg").write_bytes((f / "frame_2.jpg").read_bytes()),
         r"frame_02\.jpg and frame_2\.jpg have the same number",
