@@ -16,7 +16,7 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from bidnerf.formats.reality_capture import file_heads
-from bidnerf_core.camera import Camera, PanoramaFace, agisoft_camera
+from bidnerf_core.camera import Camera, agisoft_camera
 from bidnerf_core.datasets import (
     Capture,
     DatasetOptions,
@@ -135,12 +135,11 @@ def _camera(sensor: Element, where: str) -> Camera | None:
     adjusted = [each for each in found if each.get("class") in ("adjusted", None)][-1:] or found[:1]
     if size is None:
         return None
-    sides = " ".join(size.get(side) or "" for side in ("width", "height"))
-    width, height = pixel_size(where, numbers_in(f"{where}: its resolution", sides, 2))
+    sides = numbers_in(f"{where}: its resolution", f"{size.get('width') or ''} {size.get('height') or ''}", 2)
     kind = sensor.get("type") or "frame"
-    if kind == "spherical":
-        return PanoramaFace("front", (width, height))
-    return agisoft_camera(where, kind, (width, height), adjusted[0]) if adjusted else None
+    if not adjusted and kind != "spherical":
+        return None
+    return agisoft_camera(where, kind, pixel_size(where, sides), adjusted[0] if adjusted else sensor)
 
 
 reader = Format(
