@@ -83,15 +83,14 @@ def test_palettes_become_colours(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("bits", [10, 12, 14, 16])
-@pytest.mark.parametrize("shape", [(20, 30), (20, 30, 3), (20, 30, 4)])  # a fourth band of TIFF may be infrared
+@pytest.mark.parametrize("shape", [(20, 30), (20, 30, 3)])
 def test_sixteen_bits_have_the_range_that_the_sensor_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bits: int, shape: tuple[int, ...]
 ) -> None:
     values = np.random.default_rng(0).integers(0, 2**bits, shape, dtype=np.uint16)
     values.flat[0] = 2**bits - 1
-    path = tmp_path / ("a.tif" if shape[2:] == (4,) else "a.png")
-    cv2.imwrite(str(path), values if values.ndim == 2 else values[..., [2, 1, 0, 3][: shape[-1]]])
-    values = values.reshape(20, 30, -1)[..., :3].squeeze()
+    path = tmp_path / "a.png"
+    cv2.imwrite(str(path), values if values.ndim == 2 else values[..., ::-1])
     expected = torch.from_numpy(values.reshape(20, 30, -1).astype(np.float32) / (2**bits - 1)).expand(20, 30, 3)
     monkeypatch.setattr("bidnerf_core.io.images.STRIP", 90)
     for read in (read_image, read_compact_image):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,10 +12,9 @@ from scipy.stats import multivariate_normal
 from torch import Tensor
 
 from bidnerf import SE3
-from bidnerf_core.mapping import NUISANCES, Normal, Quadratic, States, descend, log_det, log_evidence, total
+from bidnerf_core.mapping import NUISANCES, CostTerm, Normal, Quadratic, States, descend, log_det, log_evidence, total
 
 P = 6 + len(NUISANCES)
-CostTerm = Callable[[States], Normal]
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
