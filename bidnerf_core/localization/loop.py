@@ -8,11 +8,12 @@ a mode in ``modes``, with a bound in ``accept``. ``propose`` has the proposals.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from bidnerf_core.devices import run_on
@@ -188,18 +189,13 @@ class Loop:
     ) -> LandmarkAnswer:
         """Fuse all measurements under all explanations, and judge the result; rays are rendered only where they can change it."""
         terms, fused, others = list[CostTerm]([landmarks]), list[str](), dict[str, float | None]()
-        # Up to three fits, until the explanation that a mode is linearized about is its most probable one.
-        for _ in range(3):
-            fit = run_on(self.device, fit_landmarks, best, landmarks, given)
-            row, best = best.row, fit.likeliest
-            if torch.equal(best.row, row):
-                break
+        fit = self._settle(fit_landmarks, best, torch.arange(len(best)), landmarks, given)
         found = self._posterior(fit, landmarks)
         points = self._points(found.chosen)
         if points is not None:
             terms.append(points)
             fused.append("depth")
-            fit = run_on(self.device, fit_modes, best, terms, given, 5)
+            fit = run_on(self.device, fit_modes, fit.likeliest, terms, given, 5)
             fit = replace(fit, log_odds=-run_on(self.device, cost_of, points, fit.about))
             found = self._posterior(fit, landmarks)
             near, both = run_on(self.device, agreement, points, found.chosen)
@@ -217,10 +213,9 @@ class Loop:
         views, field, bounds = self.problem.views, self.problem.field, self.problem.bounds
         rays = RenderedRays.of(views, field, bounds, self.rays, self.seed, device=where, steep=True)
         fit = self._fit_rays(found, fit, terms, rays, given, which, blur)
-        best = fit.likeliest
         loss = fit.loss
         for g in set(places) - set(which.tolist()):
-            loss[g] = replace(rays, sights=rays.sights.mirrored).loss_at(best[g : g + 1])[0]
+            loss[g] = replace(rays, sights=rays.sights.mirrored).loss_at(fit.likeliest[g : g + 1])[0]
         # Neighbouring rays share the field's errors, which the scatter of the rays' gradients does not show; it shows even
         # less of the errors of rays that agree less than usual, and of a camera that rays determine together with the pose.
         trial, states = self.landmarks.trial, fit.states
@@ -259,10 +254,10 @@ class Loop:
         terms: list[CostTerm],
         rays: RenderedRays,
         given: Explanations,
-        which: Tensor,
+        which: Int[Tensor, "r"],
         blur: float,
     ) -> ModeFits:
-        """ModeFits rays as well, for the modes ``which``; ``fit`` and its posterior ``found`` are without them.
+        """Fit rays as well, for the modes ``which``; ``fit`` and its posterior ``found`` are without them.
 
         The descent begins at the camera with which some rays agree best, of the most probable ones. The pose of a camera at rest that may
         be as stated is first refined on small images where rays would be too fine (``blur`` is in pixels). Where the rays agree clearly
@@ -280,7 +275,7 @@ class Loop:
                 coarse = refine_on_small_images(self.problem, here, blur)
                 here = coarse if float(few.loss_at(coarse)) < float(loss[first]) else here
             best = best.with_rows(g[None], here)
-        with_rays = self._settle(best, terms, rays, given, which)
+        with_rays = self._settle(fit_with_rays, best, which, terms, rays, given, which)
         # On record, three of four right poses have rays that agree better.
         agrees = with_rays.loss <= 1.3 * self.landmarks.trial.difference
         if self.landmarks.trial.difference == 0 or bool(agrees[which].all()):
@@ -290,19 +285,17 @@ class Loop:
             cameras = fit.states[(fit.states.mode == g) & (given.distinct & ~given.moves)[fit.states.row]]
             starts = States.cat([best[g[None]], cameras])
             best = best.with_rows(g[None], run_on(self.device, refine_with_rays, starts, terms, few))
-        again = self._settle(best, terms, rays, given, which)
+        again = self._settle(fit_with_rays, best, which, terms, rays, given, which)
         return again if float(again.loss[which].amin()) < float(with_rays.loss[which].amin()) else with_rays
 
-    def _settle(
-        self, best: States, terms: list[CostTerm], rays: RenderedRays, given: Explanations, which: Tensor
-    ) -> ModeFits:
-        """Return up to three fits, until the explanation that a mode is linearized about is its most probable one."""
+    def _settle(self, fit: Callable[..., ModeFits], best: States, which: Int[Tensor, "r"], *values: Any) -> ModeFits:
+        """Return up to three fits, until the explanations that the modes ``which`` are linearized about are the most probable ones."""
         for _ in range(3):
-            fit = run_on(self.device, fit_with_rays, best, terms, rays, given, which)
-            row, best = best.row, fit.likeliest
+            found = run_on(self.device, fit, best, *values)
+            row, best = best.row, found.likeliest
             if torch.equal(best.row[which], row[which]):
                 break
-        return fit
+        return found
 
     def _posterior(self, fit: ModeFits, landmarks: Landmarks) -> Posterior:
         """Return the posterior over the explanations; of two places that look the same, the one nearer to the start is likelier."""

@@ -303,7 +303,7 @@ def linearize_modes(best: States, terms: Sequence[CostTerm], given: Explanations
 
 
 def fit_landmarks(best: States, term: Landmarks, given: Explanations) -> ModeFits:
-    """ModeFits the landmarks with newly estimated noise."""
+    """Fit the landmarks with newly estimated noise."""
     return fit_modes(term.with_noise(best), [term], given, 4)
 
 
@@ -317,7 +317,7 @@ def refine_with_rays(states: States, terms: Sequence[CostTerm], rays: RenderedRa
 def fit_with_rays(
     best: States, terms: Sequence[CostTerm], rays: RenderedRays, given: Explanations, which: Int[Tensor, "r"]
 ) -> ModeFits:
-    """ModeFits the terms, and for the modes ``which`` also rays, which are too expensive to be rendered for all explanations."""
+    """Fit the terms, and for the modes ``which`` also rays, which are too expensive to be rendered for all explanations."""
     rays = rays.fitted(best[which])
     here, _ = descend(best[which], [*terms, rays], 4)
     about = best.with_rows(which, here)
