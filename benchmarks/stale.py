@@ -43,7 +43,7 @@ MEASURED: Mapping[str, Sequence[str]] = {
 def cited(root: Path) -> list[str]:
     """Return the names of the records that the captions of tables name, in the README and in the documentation."""
     pages = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
-    captions = [line for page in pages for line in page.read_text().splitlines() if line.startswith("*Records: ")]
+    captions = [text for page in pages for text in re.findall(r"^\*Records: (.*?)\.\*$", page.read_text(), re.M | re.S)]
     return sorted({name for caption in captions for name in re.findall(r"`(\w+)`", caption)})
 
 

@@ -57,7 +57,7 @@ class Records:
         for name, record in self.used.items():
             groups.setdefault(origin(record), []).append(f"`{name}`")
         parts = [f"{', '.join(names)} ({made})" for made, names in groups.items()]
-        return f"*Records: {'; '.join(parts)}.*\n"
+        return textwrap.fill(f"*Records: {'; '.join(parts)}.*", 130, break_long_words=False, break_on_hyphens=False) + "\n"
 
 
 def origin(record: Record) -> str:
@@ -343,24 +343,27 @@ def headline(records: Records) -> str:
 
 @table
 def peers(records: Records) -> str:
-    """Method ``auto`` beside SIFT with PnP, on RGB images."""
-    names = {"auto": "`auto`", "sift + pnp (pycolmap)": "SIFT, PnP (pycolmap)"}
-    rows = []
-    for scene, sensors in records["landmark_peers"]["scenes"].items():
-        for name, title in names.items():
-            p = sensors["RGB"]["peers"][name]
-            rows.append(
-                (
-                    SCENES[scene],
-                    title,
-                    _of(p["5deg 0.05"]),
-                    _of(p["1deg 0.02"]),
-                    _length(p["median_translation"]),
-                    f"{p['accepted']}, {p['silent']} wrong",
-                    _seconds(p["median_cpu_seconds"]),
-                )
-            )
-    head = ("scene", "method", "within 5°, 0.05", "within 1°, 0.02", "median error", "accepted", "CPU time")
+    """Method ``auto`` beside SIFT with PnP on RGB images, and beside ICP on the depth of RGB-D images, all without a start."""
+    names = {"auto": "`auto`", "sift + pnp (pycolmap)": "SIFT, PnP (pycolmap)", "open3d icp": "RANSAC, ICP (Open3D)"}
+    measured = [(scene, "RGB", found["RGB"]["peers"]) for scene, found in records["landmark_peers"]["scenes"].items()]
+    for name in ("registration_room", "registration_lego"):
+        measured.append((records[name]["data"], "RGB-D", records[name]["methods"]))
+    rows = [
+        (
+            SCENES[scene],
+            images,
+            title,
+            _of(found[name]["5deg 0.05"]),
+            _of(found[name]["1deg 0.02"]),
+            _length(found[name]["median_translation"]),
+            f"{found[name]['accepted']}, {found[name]['silent']} wrong" if "accepted" in found[name] else "",
+            _seconds(found[name]["median_cpu_seconds"]),
+        )
+        for scene, images, found in measured
+        for name, title in names.items()
+        if name in found
+    ]
+    head = ("scene", "images", "method", "within 5°, 0.05", "within 1°, 0.02", "median error", "accepted", "CPU time")
     return _table(head, rows, records)
 
 
@@ -377,7 +380,7 @@ def field_helps(records: Records) -> str:
 
 @table
 def training_times(records: Records) -> str:
-    """README's sentence about what ``bidnerf train`` takes with default settings."""
+    """A sentence about what ``bidnerf train`` takes with default settings."""
     names = (
         "map_phone_doll",
         "map_blender_lego",
