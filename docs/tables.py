@@ -57,7 +57,8 @@ class Records:
         for name, record in self.used.items():
             groups.setdefault(origin(record), []).append(f"`{name}`")
         parts = [f"{', '.join(names)} ({made})" for made, names in groups.items()]
-        return textwrap.fill(f"*Records: {'; '.join(parts)}.*", 130, break_long_words=False, break_on_hyphens=False) + "\n"
+        text = f"*Records: {'; '.join(parts)}.*"
+        return f"{textwrap.fill(text, 130, break_long_words=False, break_on_hyphens=False)}\n"
 
 
 def origin(record: Record) -> str:
