@@ -347,8 +347,8 @@ def peers(records: Records) -> str:
     """Method ``auto`` beside SIFT with PnP on RGB images, and beside ICP on the depth of RGB-D images, all without a start."""
     names = {"auto": "`auto`", "sift + pnp (pycolmap)": "SIFT, PnP (pycolmap)", "open3d icp": "RANSAC, ICP (Open3D)"}
     measured = [(scene, "RGB", found["RGB"]["peers"]) for scene, found in records["landmark_peers"]["scenes"].items()]
-    for name in ("registration_room", "registration_lego"):
-        measured.append((records[name]["data"], "RGB-D", records[name]["methods"]))
+    by_depth = [records[name] for name in ("registration_room", "registration_lego")]
+    measured += [(record["data"], "RGB-D", record["methods"]) for record in by_depth]
     rows = [
         (
             SCENES[scene],
