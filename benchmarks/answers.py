@@ -394,7 +394,7 @@ class Planes:
         self._questions: list[tuple[tuple[str, str, str, str], Callable[[], Question]]] = []
         for number, scene in enumerate(planar_scenes.scenes()):
             generator = Generator().manual_seed(number)
-            planar, localizer = planar_scenes.mapped(scene, generator)
+            planar, localizer = planar_scenes.make_map(scene, generator)
             digest = hashlib.blake2b(planar.landmarks.positions.numpy().tobytes(), digest_size=6)
             self.content.append(digest.hexdigest())
             poses = scene.poses(self.QUERIES, generator)
