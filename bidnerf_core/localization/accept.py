@@ -90,9 +90,8 @@ class Bound(NamedTuple):
     outcome: Outcome
     reason: str  # with the value as ``{0}``, and the limit as ``{1}``
     is_open: bool = False  # whether rendered rays may change the measure
-    with_rays: float | None = (
-        None  # the limit if rays were rendered, which confirm or contradict what the measure shows
-    )
+    # the limit if rays were rendered, which confirm or contradict what the measure shows
+    with_rays: float | None = None
 
     def keeps(self, value: float) -> bool:
         """Return whether a value satisfies the limit; NaN never does."""

@@ -2,8 +2,8 @@
 
 If the map has landmarks, they are matched first, and the resulting pose is fused with measured depth and rendered rays. If the map has
 no landmarks, or has few and that pose is not accepted, the surface is searched: measured points are aligned with the surface if there
-is enough depth; otherwise, the images are compared with renderings of the surface. In a map with neither surface nor landmarks, ``auto``
-needs a start, from which it descends as ``bid`` does.
+is enough depth; otherwise, the images are compared with renderings of the surface, in a map with landmarks only if its trial missed some
+of the map's own images. In a map with neither surface nor landmarks, ``auto`` needs a start, from which it descends as ``bid`` does.
 """
 
 from __future__ import annotations
@@ -161,14 +161,15 @@ def within_risk(found: Localization, risk: float | None) -> Localization:
 
 
 def within_limits(found: Localization, config: Any) -> Localization:
-    """Return the answer, rejected as ``uncertain`` if it does not keep the ``tolerance`` or the ``risk`` of the settings, if they have any.
+    """Return the answer, rejected as ``uncertain`` if it does not keep the ``tolerance`` of ``AutoConfig`` or the ``risk`` of the settings.
 
     It keeps the tolerance if its covariance puts four fifths of the probability within it, and within 0.05 radians.
     """
-    tolerance: float | None = getattr(config, "tolerance", None)
-    if tolerance is not None and found.converged and found.covariance is not None:
-        one = torch.ones(1, dtype=torch.float64)
-        mass = mass_within(one, torch.zeros((1, 6)).double(), found.covariance[None], tolerance)
+    tolerance = config.tolerance if isinstance(config, AutoConfig) else None
+    if tolerance is not None and found.converged:
+        one, mass = torch.ones(1, dtype=torch.float64), 0.0
+        if found.covariance is not None:
+            mass = mass_within(one, torch.zeros((1, 6)).double(), found.covariance[None], tolerance)
         if mass < 0.8:
             why = f"the position is right within {tolerance:g} with a probability of {mass:.0%}, expected at least 80%"
             found = found.rejected(Verdict(Outcome.UNCERTAIN, why, found.confidence))

@@ -1,7 +1,7 @@
 """Hypotheses about a query's camera and the camera's motion, each with a prior probability.
 
 An explanation is a Gaussian prior on the nuisances of ``states``; a proposal is a pose from which all explanations are refined. Other
-places and the mirror image are modes in ``loop``, each with all explanations.
+places and the mirror image are in ``modes``, each with all explanations.
 """
 
 from __future__ import annotations

@@ -281,13 +281,13 @@ class Loop:
         agrees = with_rays.loss <= 1.3 * self.landmarks.trial.difference
         if self.landmarks.trial.difference == 0 or bool(agrees[which].all()):
             return with_rays
-        best = with_rays.likeliest
-        for g in which[~agrees[which]]:
+        worse, best = which[~agrees[which]], with_rays.likeliest
+        for g in worse:
             cameras = fit.states[(fit.states.mode == g) & (given.distinct & ~given.moves)[fit.states.row]]
             starts = States.cat([best[g[None]], cameras])
             best = best.with_rows(g[None], run_on(self.device, refine_with_rays, starts, terms, few))
         again = self._settle(fit_with_rays, best, which, terms, rays, given, which)
-        return again if float(again.loss[which].amin()) < float(with_rays.loss[which].amin()) else with_rays
+        return again if float(again.loss[worse].amin()) < float(with_rays.loss[worse].amin()) else with_rays
 
     def _settle(self, fit: Callable[..., ModeFits], best: States, which: Int[Tensor, "r"], *values: Any) -> ModeFits:
         """Return up to three fits, until the explanations that the modes ``which`` are linearized about are the most probable ones."""

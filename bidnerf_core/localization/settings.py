@@ -76,9 +76,8 @@ class AutoConfig(Settings):
     # number of rays rendered for each of the fine steps, and of fractions of it before
     fine_rays: Annotated[int, Range(7, 10**7), EXPERT] = 1024
     colour: Annotated[ColourSettings, EXPERT] = ColourSettings()
-    converged_inliers: Annotated[float, Range(0.0), EXPERT] = (
-        0.93  # minimum inlier fraction of the rays for an accepted pose
-    )
+    # minimum inlier fraction of the rays for an accepted pose
+    converged_inliers: Annotated[float, Range(0.0), EXPERT] = 0.93
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -213,3 +213,4 @@ def test_a_tolerance_rejects_what_is_less_certain(tolerance: float | None, accep
     found = within_limits(replace(answer(), covariance=covariance), AutoConfig(tolerance=tolerance))
     assert found.converged is accepted
     assert accepted or "within 0.02 with a probability of 3" in found.reason
+    assert within_limits(answer(), AutoConfig(tolerance=tolerance)).converged is (tolerance is None)  # no covariance

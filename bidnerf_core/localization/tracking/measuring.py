@@ -196,7 +196,9 @@ class Measurer:
         deviation[:, DEPTH] = DEPTH_WIDTH * self.sensor.scale
         log_prior = torch.tensor([1 - moving, moving], dtype=torch.float64).log()
         both = torch.tensor([False, True])
-        given = Explanations(("exact", "exact"), both, 0 * deviation, deviation, log_prior, both | True)
+        given = Explanations(
+            ("exact", "exact"), both, 0 * deviation, deviation, log_prior, torch.ones(2, dtype=torch.bool)
+        )
         states, rounds = given.about(fit.states), 2
         if not fit.is_recognised:
             states, rounds = states[int(state.moves) :][:1], 1 + state.moves
