@@ -435,6 +435,24 @@ def other_answers(records: Records) -> str:
 
 
 @table
+def several_maps(records: Records) -> str:
+    """Unchanged images on four maps of each scene, of which three are trained from halves of the training images."""
+    maps = dict[tuple[str, str], list[dict[str, Any]]]()
+    for name, some in records["answers_unchanged"]["counts"].items():
+        scene, _, sensor = name.partition(", ")
+        if scene != "all":
+            maps.setdefault((SCENES[scene.partition("@")[0]], sensor), []).append(some["all"])
+    rows = []
+    for (scene, sensor), cells in maps.items():
+        sums = [sum(cell[key] for cell in cells) for key in ("n", "right", "strict", "accepted", "silent")]
+        inside = "/".join(str(sum(cell["inside"][part] for cell in cells)) for part in (0, 1))
+        least = min((cell["accepted"] - cell["silent"]) / cell["right"] for cell in cells)
+        rows.append((scene, sensor, *sums, f"{least:.0%}", inside))
+    head = ("scene", "input", "answers", "right", "within 1°, 0.02", "accepted", "of these wrong")
+    return _table((*head, "right ones accepted, least of the maps", "inside the 95 % bound"), rows, records)
+
+
+@table
 def unknown(records: Records) -> str:
     """Images to which no answer is right, or more than one."""
     rows = []
