@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -121,7 +121,7 @@ def test_a_run_resumes_after_a_torn_line_and_refuses_another_map(
         def __init__(self, name: str) -> None:
             self.name = name
 
-        def questions(self, share: float) -> Iterator[Any]:
+        def questions(self, share: float, only: Sequence[str]) -> Iterator[Any]:
             for frame in "abc":
                 key = (self.name, "RGB", "as it is", frame)
                 yield key, lambda key=key: self.question(key)
@@ -132,10 +132,10 @@ def test_a_run_resumes_after_a_torn_line_and_refuses_another_map(
 
     monkeypatch.setattr(answers, "Subject", Fake)
     out = tmp_path / "rows.jsonl"
-    answers.run(["room"], out, 1.0)
+    answers.run(["room"], out, 1.0, ())
     whole = answers.read_rows(out)
     out.write_bytes(out.read_bytes()[:-20])
-    answers.run(["room"], out, 1.0)
+    answers.run(["room"], out, 1.0, ())
     assert asked == ["a", "b", "c", "c"]
     again = answers.read_rows(out)
     assert {key: answers.without_time(some) for key, some in again.items()} == {
@@ -143,7 +143,7 @@ def test_a_run_resumes_after_a_torn_line_and_refuses_another_map(
     }
     monkeypatch.setattr(Fake, "content", ["other weights"])
     with pytest.raises(InputError, match="answers of another map of room"):
-        answers.run(["room"], out, 1.0)
+        answers.run(["room"], out, 1.0, ())
 
 
 def test_two_files_are_compared(answers: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -152,7 +152,7 @@ def test_two_files_are_compared(answers: ModuleType, tmp_path: Path, capsys: pyt
     first = write_rows(tmp_path / "a.jsonl", rows)
     answers.compare([first])
     lines = capsys.readouterr().out.splitlines()
-    assert "| room | RGB | all | 4 | 2 | 1 | 3 | 2 | 1/2 | 1.00 | 3.00 |" in lines
+    assert "| room | RGB | all | 4 | 2 | 1 | 3 | 2 | 1/2 | 0.19 | 1.00 | 3.00 |" in lines
     # Of ten answers that the first file has right, the second has none.
     right, wrong = [row(0.01, True)] * 10 + rows[:1], [row(9.0, True)] * 10 + rows[:1]
     answers.compare([write_rows(tmp_path / "b.jsonl", right), write_rows(tmp_path / "c.jsonl", wrong)])
