@@ -66,8 +66,13 @@ class ClosedFormScene:
         distance, _ = self._nearest(
             T_world_camera.translation.to(centres)[:, None], centres.reshape(-1, 3).T.contiguous()
         )
-        depth = (torch.where(distance.isfinite(), distance, 0).reshape_as(length) / length).float()
-        return Frame(name or self.name, rgb.mean(0), intrinsics, depth, met.isfinite().float().mean(0))
+        return Frame(
+            name or self.name,
+            rgb.mean(0),
+            intrinsics,
+            (torch.where(distance.isfinite(), distance, 0).reshape_as(length) / length).float(),
+            met.isfinite().float().mean(0),
+        )
 
     def _nearest(self, origins: Float[Tensor, "3 #n"], rays: Float[Tensor, "3 n"]) -> tuple[Tensor, Tensor]:
         """Return the distance to the first surface (metres; inf: none) and the index of its primitive (-1: none)."""
@@ -144,6 +149,5 @@ def look_around(bounds: SceneBounds, count: int, seed: int = 0, spread: float = 
         forward = middle.new_tensor([math.cos(azimuth), math.sin(azimuth), 0.0])
         sideways = (chance[:3] - 0.5) * middle.new_tensor([0.4, 0.4, 0.3])
         eye = middle + half * (sideways - spread * forward + middle.new_tensor([0.0, 0.0, 0.15]))
-        tilt = middle.new_tensor([0.0, 0.0, 0.15 - 0.6 * chance[3].item()])
-        poses.append(look_at(eye, eye + forward + tilt))
+        poses.append(look_at(eye, eye + forward + middle.new_tensor([0.0, 0.0, 0.15 - 0.6 * chance[3].item()])))
     return poses

@@ -70,8 +70,9 @@ class ClosedFormData(Capture):
                 raise InputError(f"no frame {name!r}", where=self.path, expected=expected)
             pose = by_name[own].T_world_camera
             assert pose is not None
-            turned = rotate_about(pose, middle, up, float(angle or 0))
-            selected.append(replace(by_name[own], T_world_camera=turned, name=name))
+            selected.append(
+                replace(by_name[own], T_world_camera=rotate_about(pose, middle, up, float(angle or 0)), name=name)
+            )
         return selected
 
     def sequence(self, name: str, count: int, angle: float) -> tuple[str, ...]:
@@ -109,8 +110,7 @@ def closed_form_data(name: str) -> ClosedFormData:
 def closed_form_map(name: str) -> Map:
     """Return the map ``demo:NAME``. Raises ``InputError`` for a name whose field is not known in closed form."""
     _check(name, ("blobs",), "map")
-    info = MapInfo("closed-form", {}, BLOBS, 0, True, "demo:blobs", weights="exact", unit="metres")
-    return Map(info, BLOB_FIELD)
+    return Map(MapInfo("closed-form", {}, BLOBS, 0, True, "demo:blobs", weights="exact", unit="metres"), BLOB_FIELD)
 
 
 def _check(name: str, known: Sequence[str], what: str) -> None:

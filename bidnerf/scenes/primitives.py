@@ -204,8 +204,7 @@ class Primitive:
         T = self.T_world_shape.to(directions)
         turned = T.rotation.mT @ directions
         enter, leave = self.shape.interval(T.rotation.mT @ (origins - T.translation[:, None]), turned)
-        first = torch.where(enter > 0, enter, leave)
-        return torch.where((leave >= enter) & (leave > 0), first, torch.inf)
+        return torch.where((leave >= enter) & (leave > 0), torch.where(enter > 0, enter, leave), torch.inf)
 
     def surface(self, points: Float[Tensor, "3 n"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
         """Return the unlit colour (in [0, 1]) and the outward normal (world) at points of the surface (world)."""

@@ -156,8 +156,9 @@ def _add_protocol(app: FastAPI, path: str, name: str, protocol: ServiceProtocol,
             map = request.path_params.get("map", request.query_params.get("map"))
             if map is None and len(names) > 1:
                 raise InputError("several maps are served", expected=f"map as one of {', '.join(names)}")
-            task = {"map": names[0] if map is None else map, "protocol": name, "body": body}
-            content = await _ask_worker(request, task)
+            content = await _ask_worker(
+                request, {"map": names[0] if map is None else map, "protocol": name, "body": body}
+            )
         accepts = protocol.media_type.partition(";")[0] in request.headers.get("accept", "")
         return JSONResponse(content, media_type=protocol.media_type if accepts else "application/json")
 
@@ -187,8 +188,9 @@ async def _ask_worker(request: Request, task: dict[str, Any]) -> Any:
     pool.outcomes.labels(map=map or "", outcome=answer["outcome"]).inc()
     facts |= {key: answer[key] for key in ("outcome", "worker", "fault") if key in answer}
     if answer["status"] != 200:
-        detail = answer["detail"] or FAILED.format(request.state.id)
-        raise Refused(answer["status"], detail, None, **answer.get("more", {}))
+        raise Refused(
+            answer["status"], answer["detail"] or FAILED.format(request.state.id), None, **answer.get("more", {})
+        )
     return answer["body"]
 
 

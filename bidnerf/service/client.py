@@ -57,20 +57,25 @@ class ServiceClient:
         per step of the depth image) and ``seed``.
         """
         edge = uuid.uuid4().hex
-        rows = getattr(start, "tolist", lambda: start)()
         files = {
             "photo": _png(photo) if hasattr(photo, "shape") else photo,
             "depth": _npy(depth) if hasattr(depth, "shape") else depth,
             "camera": camera,
-            "start": None if start is None else json.dumps(rows).encode(),
+            "start": None if start is None else json.dumps(getattr(start, "tolist", lambda: start)()).encode(),
         }
         parts = [
             _part(edge, name, str(value).encode()) for name, value in {**known, "map": map}.items() if value is not None
         ]
         for name, file in files.items():
             if file is not None:
-                content = file if isinstance(file, bytes) else Path(file).read_bytes()
-                parts.append(_part(edge, name, content, name if isinstance(file, bytes) else Path(file).name))
+                parts.append(
+                    _part(
+                        edge,
+                        name,
+                        file if isinstance(file, bytes) else Path(file).read_bytes(),
+                        name if isinstance(file, bytes) else Path(file).name,
+                    )
+                )
         body = b"".join(parts) + f"--{edge}--\r\n".encode()
         return self.ask("/localize", body, f"multipart/form-data; boundary={edge}")
 
@@ -157,6 +162,5 @@ def _png(array: Any) -> bytes:
 
     height, width = pixels.shape[:2]
     head = struct.pack(">IIBBBBB", width, height, 8, kinds[pixels.shape[2:]], 0, 0, 0)
-    rows = [b"\0" + row.tobytes() for row in pixels]
-    data = chunk(b"IDAT", zlib.compress(b"".join(rows), 1))
+    data = chunk(b"IDAT", zlib.compress(b"".join([b"\0" + row.tobytes() for row in pixels]), 1))
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + data + chunk(b"IEND", b"")

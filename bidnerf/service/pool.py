@@ -86,8 +86,9 @@ class Pool:
         self.waited = times("bidnerf_queue_seconds", "Waiting for a worker.")
         gauge = partial(Gauge, registry=self.registry)
         gauge("bidnerf_queue_length", "Requests that wait for a worker.").set_function(lambda: self.queue.waiting)
-        text = "Requests that are uploading, waiting or at work."
-        gauge("bidnerf_requests_in_progress", text).set_function(lambda: self.queue.taken)
+        gauge("bidnerf_requests_in_progress", "Requests that are uploading, waiting or at work.").set_function(
+            lambda: self.queue.taken
+        )
         gauge("bidnerf_workers", "Workers that are alive.").set_function(lambda: len(self.workers))
 
     def metric(self, name: str, **labels: str) -> float:

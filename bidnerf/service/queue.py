@@ -45,8 +45,11 @@ class RequestQueue(Generic[AnyExecutor]):
     def slot(self) -> Iterator[None]:
         """Occupy a slot within the block. Raises ``Refused`` if none is free."""
         if self.taken >= self.slots:
-            headers = {"Retry-After": str(self._retry_after()), "Connection": "close"}
-            raise Refused(429, f"all {self.slots} places are taken, try again later", headers)
+            raise Refused(
+                429,
+                f"all {self.slots} places are taken, try again later",
+                {"Retry-After": str(self._retry_after()), "Connection": "close"},
+            )
         self.taken += 1
         try:
             yield

@@ -85,8 +85,9 @@ def serve(
         raise InputError("this system has no fork, but workers share the maps' memory by forking; use Linux or macOS")
     import_extra("uvicorn", "serve", "the service")
     token = choose_token(host, token)
-    app = service_app(scenes, token=token, **options)
-    run_app(app, host, port, lambda address: ready and ready(address, token), stop)
+    run_app(
+        service_app(scenes, token=token, **options), host, port, lambda address: ready and ready(address, token), stop
+    )
 
 
 def choose_token(host: str | None, token: str | None) -> str | None:

@@ -56,10 +56,12 @@ class BackendContract:
         for defect in interface_defects(self._backend(), ("config_type",), {}):
             require(who, (False, defect))
         steps = getattr(kind(), "steps", None)
-        is_length = type(steps) is int and steps > 0
         require(
             f"{who}.config_type {kind.__name__}",
-            (is_length, f"has steps = {steps!r}, expected a field of type int: the length of a training"),
+            (
+                type(steps) is int and steps > 0,
+                f"has steps = {steps!r}, expected a field of type int: the length of a training",
+            ),
         )
 
     def test_config_survives_json(self) -> None:
@@ -130,8 +132,13 @@ class BackendContract:
             names = (f.name for f in dataclasses.fields(rays))
             elsewhere = dataclasses.replace(rays, **{name: getattr(rays, name).cuda() for name in names})
             found = field_checks.render_channels(cast(RadianceField, moved), elsewhere, "rays on CUDA").cpu()
-        same = field_checks.close(found, field_checks.render_channels(field, rays, "rays"), 2e-2)
-        require(type(field).__name__, (same, "renders otherwise on CUDA than on the CPU"))
+        require(
+            type(field).__name__,
+            (
+                field_checks.close(found, field_checks.render_channels(field, rays, "rays"), 2e-2),
+                "renders otherwise on CUDA than on the CPU",
+            ),
+        )
 
     test_query_serves_several_threads = _on_levels(field_checks.check_threads)
 
@@ -198,8 +205,7 @@ class BackendContract:
     def _backend(self) -> Any:
         if self.name is not None:
             return load_backend(self.name)
-        given = self.backend is not None
-        require(type(self).__name__, (given, "has neither backend nor name, expected one of them"))
+        require(type(self).__name__, (self.backend is not None, "has neither backend nor name, expected one of them"))
         return self.backend
 
     def _config(self) -> Any:

@@ -61,8 +61,7 @@ class MethodContract(Named):
 
     def test_method_says_what_it_is(self) -> None:
         method = self._part(METHODS.load)
-        parts = {"solve": ("problem", "config", "seed")}
-        for defect in interface_defects(method, ("summary", "config_type"), parts):
+        for defect in interface_defects(method, ("summary", "config_type"), {"solve": ("problem", "config", "seed")}):
             require(self._who, (False, defect))
         summary, kind = method.summary, method.config_type
         require(self._who, (is_one_line(summary), f"summary is {summary!r}, expected one line of text"))
@@ -89,13 +88,13 @@ class MethodContract(Named):
     def test_answer_is_sound(self) -> None:
         found = self._first()
         covariance = torch.eye(6) if found.covariance is None else found.covariance
-        symmetric = torch.allclose(covariance, covariance.mT, rtol=1e-6)
         require(
             self._who,
             (found.T_world_camera.is_rigid(), "the pose is not a rigid transform"),
             (found.reason.strip() != "", "the answer has no reason, expected one in words"),
             (
-                symmetric and float(torch.linalg.eigvalsh(covariance.double())[0]) > 0,
+                torch.allclose(covariance, covariance.mT, rtol=1e-6)
+                and float(torch.linalg.eigvalsh(covariance.double())[0]) > 0,
                 "the covariance is not symmetric and positive definite",
             ),
         )
@@ -110,8 +109,7 @@ class MethodContract(Named):
         )
 
     def test_pose_moves_with_the_world(self) -> None:
-        truth = T_MOVED_WORLD @ unseen().T_ref_camera
-        here, there = self._first(), self._localize(moved_map(), unseen().frame, truth)
+        here, there = self._first(), self._localize(moved_map(), unseen().frame, T_MOVED_WORLD @ unseen().T_ref_camera)
         error = _difference(there.T_world_camera, T_MOVED_WORLD @ here.T_world_camera)
         require(
             f"{self._who}, in a world that is moved",
@@ -124,8 +122,9 @@ class MethodContract(Named):
         )
 
     def test_image_of_another_scene_is_rejected(self) -> None:
-        scene = textured_map(surface=True)
-        found = self._localize(scene, seen(POSES[1], GROUND_CAMERA, "other", seed=1).frame, POSES[1])
+        found = self._localize(
+            textured_map(surface=True), seen(POSES[1], GROUND_CAMERA, "other", seed=1).frame, POSES[1]
+        )
         require(
             self._who,
             (
@@ -139,8 +138,13 @@ class MethodContract(Named):
         if not self._part(METHODS.load).needs_start:
             return
         localizer = Localizer(textured_map(surface=True), self.name, self.config, warm_up=False)
-        refused = is_refused(lambda: localizer(unseen().frame))
-        require(self._who, (refused, "needs a start, but does without one, expected an InputError"))
+        require(
+            self._who,
+            (
+                is_refused(lambda: localizer(unseen().frame)),
+                "needs a start, but does without one, expected an InputError",
+            ),
+        )
 
     def _first(self) -> Localization:
         """Return the answer for an image of the map's scene, found once per test class."""
@@ -197,11 +201,10 @@ class FeaturesContract(Named):
                 ),
             )
             inside = (pixels >= 0).all() and (pixels <= torch.tensor([width, height])).all()
-            positive = (sizes > 0).all()
             require(
                 who,
                 (inside, "keypoints lie outside the image"),
-                (positive, "sizes are not positive, expected pixels"),
+                ((sizes > 0).all(), "sizes are not positive, expected pixels"),
             )
 
     def test_descriptors_have_one_length(self) -> None:
@@ -282,10 +285,12 @@ class FaultContract(Named):
     def test_fault_says_what_it_is(self) -> None:
         fault = self._fault
         sizes = [*fault.sizes, *([] if fault.neutral is None else [fault.neutral])]
-        texts = (("summary", fault.summary), ("unit", fault.unit))
         require(
             self._who,
-            *((is_one_line(t), f"{what} is {t!r}, expected one line of text") for what, t in texts),
+            *(
+                (is_one_line(t), f"{what} is {t!r}, expected one line of text")
+                for what, t in (("summary", fault.summary), ("unit", fault.unit))
+            ),
             (len(fault.sizes) > 0, "no sizes, expected those worth measuring"),
             *((s in fault.allowed, f"size {s:g} is not allowed, expected {fault.allowed}") for s in sizes),
         )
@@ -294,19 +299,27 @@ class FaultContract(Named):
         frame = _frame()
         for size in self._fault.sizes:
             found = self._change(frame, size)
-            changed = (
-                not _same(found, frame)
-                or found.intrinsics != frame.intrinsics
-                or found.focal_is_approximate != frame.focal_is_approximate
-                or self._fault.T_true_faulty is not None
+            require(
+                self._who,
+                (
+                    not _same(found, frame)
+                    or found.intrinsics != frame.intrinsics
+                    or found.focal_is_approximate != frame.focal_is_approximate
+                    or self._fault.T_true_faulty is not None,
+                    f"size {size:g} changes nothing, expected a fault",
+                ),
             )
-            require(self._who, (changed, f"size {size:g} changes nothing, expected a fault"))
 
     def test_same_seed_gives_the_same_image(self) -> None:
         expected = "expected all randomness to come from the generator"
         for size in self._fault.sizes:
-            same = _same(*(self._change(_frame(), size) for _ in range(2)))
-            require(self._who, (same, f"two calls with one seed differ, {expected}"))
+            require(
+                self._who,
+                (
+                    _same(*(self._change(_frame(), size) for _ in range(2))),
+                    f"two calls with one seed differ, {expected}",
+                ),
+            )
 
     def test_image_stays_an_image(self) -> None:
         for size in self._fault.sizes:

@@ -217,8 +217,13 @@ def check_jacobian(field: RadianceField, dtype: torch.dtype) -> None:
         ("the derivative by position", found.by_position, expected.by_position),
         ("the derivative by direction", found.by_direction @ across, expected.by_direction @ across),
     ):
-        same = ours.shape == theirs.shape and float((ours - theirs).norm()) <= 1e-3 * float(theirs.norm()) + 1e-9
-        require(who, (same, f"{what} differs from that of query"))
+        require(
+            who,
+            (
+                ours.shape == theirs.shape and float((ours - theirs).norm()) <= 1e-3 * float(theirs.norm()) + 1e-9,
+                f"{what} differs from that of query",
+            ),
+        )
 
 
 def check_pose_gradient(field: RadianceField, dtype: torch.dtype) -> None:
@@ -284,8 +289,7 @@ def check_intervals(field: RadianceField) -> None:
 def _arrangements() -> Iterator[Rays]:
     """Yield batches of rays with various shapes, some of them without any rays."""
     for shape in ((), (1,), (2, 3), (0,), (2, 0)):
-        index = torch.arange(torch.Size(shape).numel()).reshape(shape)
-        yield select_rays(awkward_rays()["rays from outside"], index)
+        yield select_rays(awkward_rays()["rays from outside"], torch.arange(torch.Size(shape).numel()).reshape(shape))
 
 
 def check_repeatable(field: RadianceField) -> None:
@@ -346,8 +350,10 @@ def check_levels(field: RadianceField) -> None:
     offered = tuple(getattr(field, "levels", None) or (field,))
     expected = "expected a field: an object with sampler and query"
     for number, level in enumerate(offered):
-        is_field = isinstance(level, RadianceField)
-        require(type(field).__name__, (is_field, f"levels[{number}] is a {type(level).__name__}, {expected}"))
+        require(
+            type(field).__name__,
+            (isinstance(level, RadianceField), f"levels[{number}] is a {type(level).__name__}, {expected}"),
+        )
     rays = join_rays(list(awkward_rays().values()))
     require(
         f"{type(field).__name__}.levels",

@@ -41,8 +41,9 @@ class PoserContract(Named):
             photos, out = Path(folder) / "photos", Path(folder) / "poses"
             photos.mkdir()
             for name, T in truth.items():
-                pixels = (photograph(T, PHOTO_CAMERA) * 255).round().to(torch.uint8)
-                Image.fromarray(pixels.numpy()).save(photos / f"{name}.png")
+                Image.fromarray((photograph(T, PHOTO_CAMERA) * 255).round().to(torch.uint8).numpy()).save(
+                    photos / f"{name}.png"
+                )
             with calling(f"{self._who} of {len(truth)} photos"):
                 record = self._part(POSERS.load)(photos, out, PHOTO_CAMERA)
             with calling(f"reading the dataset of {self._who}"):
@@ -58,8 +59,7 @@ class PoserContract(Named):
             ),
         )
         found, true = SE3.stack([view.T_ref_camera for view in views]), SE3.stack([truth[name] for name in names])
-        aligned = fit_similarity(found.translation, true.translation)
-        moved = aligned.move(found)
+        moved = fit_similarity(found.translation, true.translation).move(found)
         error = float((true.inverse() @ moved).log().norm(dim=-1).max())
         require(
             self._who,

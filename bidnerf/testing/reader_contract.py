@@ -42,12 +42,14 @@ class ReaderContract(Named):
         reader = self._part(READERS.load)
         with tempfile.TemporaryDirectory() as empty, calling(f"{self._who}.recognises"):
             is_own, is_any = reader.recognises(Path(self.folder)), reader.recognises(Path(empty))
-        text = isinstance(reader.expected, str) and reader.expected.strip() != ""
         require(
             self._who,
             (is_own, f"does not recognise {self.folder}"),
             (not is_any, "recognises an empty folder"),
-            (text, f"expected is {reader.expected!r}, expected the files of the format in words"),
+            (
+                isinstance(reader.expected, str) and reader.expected.strip() != "",
+                f"expected is {reader.expected!r}, expected the files of the format in words",
+            ),
         )
 
     def test_names_are_unique(self) -> None:
@@ -70,8 +72,13 @@ class ReaderContract(Named):
     def test_poses_are_rigid(self) -> None:
         for view in self._views():
             pose = view.T_ref_camera
-            is_right = bool(pose.is_rigid()) and pose.translation.dtype == torch.float64
-            require(self._who, (is_right, f"the pose of {view.frame.name} is not a rigid transform in float64"))
+            require(
+                self._who,
+                (
+                    bool(pose.is_rigid()) and pose.translation.dtype == torch.float64,
+                    f"the pose of {view.frame.name} is not a rigid transform in float64",
+                ),
+            )
 
     def test_images_are_images(self) -> None:
         for frame in (view.frame for view in self._views()):
@@ -127,14 +134,17 @@ class ReaderContract(Named):
 
     def test_reading_twice_gives_the_same(self) -> None:
         for a, b in zip(self._views(), self._views(), strict=True):
-            same = (
-                a.frame.name == b.frame.name
-                and torch.equal(a.frame.rgb, b.frame.rgb)
-                and torch.equal(a.T_ref_camera.matrix(), b.T_ref_camera.matrix())
-                and a.frame.intrinsics == b.frame.intrinsics
-                and equal(a.frame.depth, b.frame.depth)
+            require(
+                self._who,
+                (
+                    a.frame.name == b.frame.name
+                    and torch.equal(a.frame.rgb, b.frame.rgb)
+                    and torch.equal(a.T_ref_camera.matrix(), b.T_ref_camera.matrix())
+                    and a.frame.intrinsics == b.frame.intrinsics
+                    and equal(a.frame.depth, b.frame.depth),
+                    f"{a.frame.name} differs when it is read again",
+                ),
             )
-            require(self._who, (same, f"{a.frame.name} differs when it is read again"))
 
     def _dataset(self, **options: Any) -> Capture:
         with calling(f"{self._who}: read of {self.folder}"):

@@ -105,8 +105,7 @@ def check_exposure(backend: Backend, config: Any) -> None:
     for log_gain in (EXPOSURE, -EXPOSURE):
         with calling(f"{type(backend).__name__}.build"):
             fields.append(backend.build(config, DIMMED_BOUNDS))
-        views = exposed_views(log_gain)
-        _train(backend, fields[-1], views, config, Recorder(), "on RGB views of different exposure")
+        _train(backend, fields[-1], exposed_views(log_gain), config, Recorder(), "on RGB views of different exposure")
     found = []
     for number, view in enumerate(exposed_views(0.0)):
         bright, dark = (render_training_view(field, view, DIMMED_BOUNDS) for field in fields)

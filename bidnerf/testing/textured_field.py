@@ -89,8 +89,9 @@ def photograph(T: SE3, camera: Intrinsics) -> Float[Tensor, "h w 3"]:
 
 @functools.cache
 def training_views(count: int = 10) -> tuple[View, ...]:
-    poses = orbit(1.8, count, elevation=(45.0, 75.0), seed=0)
-    return tuple(textured_view(T, f"{number:04d}") for number, T in enumerate(poses))
+    return tuple(
+        textured_view(T, f"{number:04d}") for number, T in enumerate(orbit(1.8, count, elevation=(45.0, 75.0), seed=0))
+    )
 
 
 @functools.cache
@@ -102,8 +103,7 @@ def unseen() -> View:
 @functools.cache
 def textured_map(surface: bool = False) -> MapWithLandmarks:
     if surface:
-        baked = bake(ground(), BOUNDS, [], training_views(), BakeConfig(cells=200_000))
-        return replace(textured_map(), surface=baked)
+        return replace(textured_map(), surface=bake(ground(), BOUNDS, [], training_views(), BakeConfig(cells=200_000)))
     return MapWithLandmarks(ground(), BOUNDS, build_landmarks(training_views()))
 
 

@@ -130,8 +130,11 @@ def answer_json(
             )
         frame = localization.frame_as_taken(frame)
         small = frame.intrinsics.at_most(OBSERVED)
-        observed = jpeg_json(reduce_image(frame.rgb, small.width, small.height))
-        answer |= {"camera": camera, "shape": frustum(frame.intrinsics), "observed": observed}
+        answer |= {
+            "camera": camera,
+            "shape": frustum(frame.intrinsics),
+            "observed": jpeg_json(reduce_image(frame.rgb, small.width, small.height)),
+        }
     if finite:
         answer |= {"pose": matrix_rows(T), "ellipsoid": ellipsoid(T, localization.covariance)}
         if record is not None:

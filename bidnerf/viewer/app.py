@@ -90,8 +90,12 @@ class ShownJob:
 
     def plain(self, known: str) -> dict[str, Any]:
         """Return the state as JSON values, and the answer unless the client already knows it for this state (``known``)."""
-        caption = self.record.steps[-1].caption if self.record is not None and self.record.steps else ""
-        state = {"id": self.id, "name": self.name, "state": self.state, "caption": caption}
+        state = {
+            "id": self.id,
+            "name": self.name,
+            "state": self.state,
+            "caption": self.record.steps[-1].caption if self.record is not None and self.record.steps else "",
+        }
         return state if self.state == known else state | {"answer": to_plain(self.answer)}
 
     def run(self, localizer: Localizer, read: Read) -> None:
@@ -222,8 +226,11 @@ def viewer_app(live: LiveView, token: str | None = None, limits: ServiceLimits |
     async def map_image(number: str) -> Response:
         cameras = scene.info.cameras
         camera = cameras[_index(number, len(cameras), "camera of the map")]
-        content = await painter.run(lambda: jpeg(thumbnail(scene, camera)))
-        return Response(content, headers={"Cache-Control": "private, max-age=3600"}, media_type="image/jpeg")
+        return Response(
+            await painter.run(lambda: jpeg(thumbnail(scene, camera))),
+            headers={"Cache-Control": "private, max-age=3600"},
+            media_type="image/jpeg",
+        )
 
     @app.post(
         "/api/photo",
@@ -246,8 +253,11 @@ def viewer_app(live: LiveView, token: str | None = None, limits: ServiceLimits |
                         query = photos.read(0)
                     except InputError as error:
                         raise InputError(public_message(error, Path(folder))) from error
-                views = tuple(view.over(scene.bounds.background) for view in query.views)
-                return Query(upload.name, views, query.truth), start, upload.seed
+                return (
+                    Query(upload.name, tuple(view.over(scene.bounds.background) for view in query.views), query.truth),
+                    start,
+                    upload.seed,
+                )
 
             return JSONResponse({"job": jobs.start(upload.name, read, slot.pop_all()).id}, 202)
 
@@ -262,8 +272,7 @@ def viewer_app(live: LiveView, token: str | None = None, limits: ServiceLimits |
         assert source is not None
         slot = contextlib.ExitStack()
         slot.enter_context(jobs.queue.slot())
-        job = jobs.start(names[index], lambda: (source.read(index), None, 0), slot)
-        return JSONResponse({"job": job.id}, 202)
+        return JSONResponse({"job": jobs.start(names[index], lambda: (source.read(index), None, 0), slot).id}, 202)
 
     @app.get("/api/job/{id}", responses=error_responses(404), summary="The state of a localization, and its answer.")
     async def job(id: str, known: str = "") -> Response:
@@ -281,8 +290,10 @@ def viewer_app(live: LiveView, token: str | None = None, limits: ServiceLimits |
         body = parse_json(await read_body(request, replace(limits, max_megabytes=0.1)), "", "a camera")
         camera = validate(VirtualCamera, body)
         intrinsics, T, render = camera.intrinsics, camera.T_world_camera, quick_image if camera.quick else field_image
-        work = asyncio.create_task(painter.run(lambda: jpeg(render(scene, intrinsics, T))))
-        return Response(await await_result(request, work), media_type="image/jpeg")
+        return Response(
+            await await_result(request, asyncio.create_task(painter.run(lambda: jpeg(render(scene, intrinsics, T))))),
+            media_type="image/jpeg",
+        )
 
     return app
 

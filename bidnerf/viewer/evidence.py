@@ -51,8 +51,9 @@ def probable_poses(answer: LandmarkAnswer) -> list[tuple[int, SE3, float]]:
     """Return the index, the most probable pose and the probability of each mode, in order of decreasing probability."""
     posterior, poses = answer.posterior, list[tuple[int, SE3, float]]()
     for mode in range(len(answer.modes)):
-        probability = float(posterior.probability[posterior.states.mode == mode].sum())
-        poses.append((mode, posterior.place(mode).to("cpu"), probability))
+        poses.append(
+            (mode, posterior.place(mode).to("cpu"), float(posterior.probability[posterior.states.mode == mode].sum()))
+        )
     return sorted(poses, key=lambda each: -each[2])
 
 
@@ -63,8 +64,14 @@ def _contest(
     of_pose: bool = True,
 ) -> JsonObject:
     """Return a comparison of poses or cameras: names, probabilities and, for other poses, the 16 numbers of T_world_camera."""
-    shown = [{"pose": None} | dict(zip(("name", "probability", "pose"), each, strict=False)) for each in answers]
-    return {"question": question, "answers": shown, "note": note, "of_pose": of_pose}
+    return {
+        "question": question,
+        "answers": [
+            {"pose": None} | dict(zip(("name", "probability", "pose"), each, strict=False)) for each in answers
+        ],
+        "note": note,
+        "of_pose": of_pose,
+    }
 
 
 def _compare_modes(localization: Localization, answer: LandmarkAnswer) -> JsonObject:
@@ -90,8 +97,12 @@ def _compare_cameras(localization: Localization, answer: LandmarkAnswer) -> Json
         shown[name] = shown.get(name, 0.0) + probability
     # Explanations that are less probable than one in a thousand are not listed.
     likely = [each for each in sorted(shown.items(), key=lambda each: -each[1]) if each[1] >= 0.001]
-    note = f"Weighed at {EARLIER}." if name_earlier(localization, answer) else ""
-    return _contest("Whose camera took it?", likely, note, of_pose=False)
+    return _contest(
+        "Whose camera took it?",
+        likely,
+        f"Weighed at {EARLIER}." if name_earlier(localization, answer) else "",
+        of_pose=False,
+    )
 
 
 def _compare_rivals(support: Support) -> JsonObject:
@@ -243,8 +254,13 @@ def acceptance_figures(localization: Localization, record: SearchRecord | None) 
     measured, answer = localization.diagnostics, last_answer(record)
     figures = list[EvidenceFigure]()
     if localization.confidence is not None and not isinstance(measured, Support):
-        meaning = "probability that the pose is right, from all figures together"
-        figures.append(EvidenceFigure.of(("confidence", ".1%", meaning), localization.confidence, ACCEPTED))
+        figures.append(
+            EvidenceFigure.of(
+                ("confidence", ".1%", "probability that the pose is right, from all figures together"),
+                localization.confidence,
+                ACCEPTED,
+            )
+        )
     if isinstance(measured, Evidence):
         figures += _landmark_figures(measured)
     elif isinstance(measured, Support):
@@ -265,8 +281,10 @@ def _landmark_figures(evidence: Evidence) -> Iterator[EvidenceFigure]:
             yield EvidenceFigure.of(text, value)
         elif measure == "log10_nfa":
             chance, limit = (10.0 ** min(max(power, -300), 300) for power in (value, bound.limit))
-            exponents = bar(bound.limit / min(value, -0.01), 1.0, False)
-            yield replace(EvidenceFigure.of(text, chance, limit, bound.is_least), bar=exponents)
+            yield replace(
+                EvidenceFigure.of(text, chance, limit, bound.is_least),
+                bar=bar(bound.limit / min(value, -0.01), 1.0, False),
+            )
         else:
             yield EvidenceFigure.of(text, value, bound.limit, bound.is_least)
 

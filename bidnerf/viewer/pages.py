@@ -118,10 +118,18 @@ def view(
         answer = answer_json(scene_map, "localization" if frame is None else frame.name, localization, frame)
         answers.append(answer if frame is None else add_renderings(answer, scene_map, localization, frame))
     elif frame is not None:
-        localizer = scene if isinstance(scene, Localizer) else Localizer(scene_map)
-        answers.append(answer_query(localizer, Query(frame.name, (View(frame, SE3.identity()),))))
-    path = None if trajectory is None else trajectory_json(Path(trajectory), scene_map.unit, scene_map.origin)
-    return MapView(map_json(scene_map), tuple(answers), title, trajectory=path)
+        answers.append(
+            answer_query(
+                scene if isinstance(scene, Localizer) else Localizer(scene_map),
+                Query(frame.name, (View(frame, SE3.identity()),)),
+            )
+        )
+    return MapView(
+        map_json(scene_map),
+        tuple(answers),
+        title,
+        trajectory=None if trajectory is None else trajectory_json(Path(trajectory), scene_map.unit, scene_map.origin),
+    )
 
 
 def require_map(scene: object) -> Map:

@@ -38,8 +38,11 @@ def pack_points(points: Float[Tensor, "n 3"]) -> JsonObject:
     values = points.detach().cpu().double().numpy()
     lower = values.min(0) if len(values) else np.zeros(3)
     size = max(float((values - lower).max(initial=0.0)), 1e-9)
-    places = ((values - lower) / size * 65535 + 0.5).astype(np.uint16)
-    return {"lower": lower.tolist(), "size": size, "places": pack(places)}
+    return {
+        "lower": lower.tolist(),
+        "size": size,
+        "places": pack(((values - lower) / size * 65535 + 0.5).astype(np.uint16)),
+    }
 
 
 def pack_colours(rgb: Float[Tensor, "n 3"]) -> JsonObject:
@@ -56,14 +59,20 @@ def jpeg(image: Float[Tensor, "h w 3"] | UInt8[np.ndarray, "h w 3"]) -> bytes:
 
 def jpeg_json(image: Float[Tensor, "h w 3"]) -> JsonObject:
     """Return an image as the data ``url`` of a JPEG, with its ``width`` and ``height`` in pixels."""
-    url = "data:image/jpeg;base64," + base64.b64encode(jpeg(image)).decode()
-    return {"url": url, "width": int(image.shape[1]), "height": int(image.shape[0])}
+    return {
+        "url": "data:image/jpeg;base64," + base64.b64encode(jpeg(image)).decode(),
+        "width": int(image.shape[1]),
+        "height": int(image.shape[0]),
+    }
 
 
 def png_json(image: UInt8[np.ndarray, "h w channels"]) -> JsonObject:
     """Return an image, with or without an alpha channel, in the format of ``jpeg_json`` but encoded as PNG."""
-    url = "data:image/png;base64," + base64.b64encode(png_bytes(image)).decode()
-    return {"url": url, "width": image.shape[1], "height": image.shape[0]}
+    return {
+        "url": "data:image/png;base64," + base64.b64encode(png_bytes(image)).decode(),
+        "width": image.shape[1],
+        "height": image.shape[0],
+    }
 
 
 def field_image(scene: SceneMap, camera: Intrinsics, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:

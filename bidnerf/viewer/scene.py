@@ -161,8 +161,7 @@ def turn_towards(
 def _landmarks(scene: Map) -> JsonObject | None:
     if scene.landmarks is None:
         return None
-    some = _subset(len(scene.landmarks), 20_000)
-    return _points(scene.landmarks.positions[some], len(scene.landmarks), 0.0)
+    return _points(scene.landmarks.positions[_subset(len(scene.landmarks), 20_000)], len(scene.landmarks), 0.0)
 
 
 def _splats(scene: Map) -> JsonObject | None:
@@ -236,10 +235,9 @@ def trajectory_json(
     other = {each[-1] for each in poses} - {unit, None}
     if unit is not None and other:
         log.info("%s: is in %s, but the map is in %s; its poses are shown as they are", path, other.pop(), unit)
-    local = SE3.stack(list(T)).translated(-torch.tensor(origin).double()).matrix()[:, :3]
     return {
         "name": path.name,
-        "poses": pack(local.flatten(1).numpy()),
+        "poses": pack(SE3.stack(list(T)).translated(-torch.tensor(origin).double()).matrix()[:, :3].flatten(1).numpy()),
         "frames": frames,
         "times": times,
         "sigmas": sigmas,

@@ -54,7 +54,7 @@ from bidnerf_core.camera import WAYS
 from bidnerf_core.localization import settings_of
 from bidnerf_core.registry import _declared
 from bombs import png_of
-from commands import Run
+from commands import Run, assert_refused
 from waiting import wait_until
 
 QUICK = {"max_steps": 3, "rays": 64}
@@ -755,7 +755,8 @@ def test_a_token_that_is_given_is_not_shown(tmp_path: Path, bidnerf: Run, monkey
     assert "Bearer made-up-0123456789" in made_up.out + made_up.err
 
 
-def test_maps_and_settings_that_cannot_be_served_are_refused() -> None:
+def test_maps_and_settings_that_cannot_be_served_are_refused(tmp_path: Path, bidnerf: Run) -> None:
+    assert_refused(bidnerf("serve", tmp_path, "--port", 0), 1, tmp_path, "expected a map")
     assert maps_by_name({"a": "x"}) == maps_by_name(["a=x"]) == {"a": Path("x")}
     assert list(maps_by_name(["x/a", "b=y/a"])) == ["a", "b"]
     for maps, part in (
