@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
-import re
 from importlib.metadata import PackageNotFoundError, requires, version
 from typing import Any, NamedTuple
 
@@ -65,10 +65,13 @@ def with_writer(error: InputError, *writers: object) -> InputError:
 
     ``writers`` are the versions that are recorded with the file.
     """
-    mine = version("bidnerf")
-    numbers = {str(each): [int(part) for part in re.findall(r"\d+", str(each))] for each in (mine, *writers)}
-    newest = max(numbers, key=lambda each: numbers[each])
-    if numbers[newest] <= numbers[mine]:
+    from packaging.version import InvalidVersion, Version
+
+    newest = mine = version("bidnerf")
+    for writer in writers:
+        with contextlib.suppress(InvalidVersion):
+            newest = max(newest, str(writer)[:40], key=Version)
+    if newest == mine:
         return InputError(error)
     return InputError(
         error, expected=f"a file of bidnerf {mine} or earlier; bidnerf {newest} wrote it, so upgrade bidnerf"

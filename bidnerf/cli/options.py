@@ -255,9 +255,11 @@ class QueryOptions:
             raise UsageError(f"--window {self.window} needs known relative poses", expected="a dataset")
         files = photo_files(paths, self.depth)
         for file in filter(Path.is_file, files):
-            with open_binary(file, "an image file") as opened:
-                if is_heif(opened.read(12)):
-                    import_extra("pillow_heif", "heif", "reading HEIC", file, "; or convert the photo to JPEG")
+            head = b""
+            with contextlib.suppress(InputError), open_binary(file, "an image file") as opened:
+                head = opened.read(12)
+            if is_heif(head):
+                import_extra("pillow_heif", "heif", "reading HEIC", file, "; or convert the photo to JPEG")
         depth = depth_files(files, self.depth)
         if not self.depth:
             of_depth = {"--depth-unit": images.depth_unit, "--register-depth": images.registration or None}

@@ -316,7 +316,9 @@ class _Parser(argparse.ArgumentParser):
         for spec in filter(None, map(find_spec, packages)):
             folders = map(Path, spec.submodule_search_locations or ())
             for file in [Path(spec.origin or ""), *(file for folder in folders for file in folder.rglob("*.py"))]:
-                fields |= {option_name(name) for name in FIELD.findall(file.read_text(encoding="utf-8"))}
+                if file.suffix == ".py" and file.is_file():  # not a namespace or an extension module
+                    source = file.read_text(encoding="utf-8", errors="replace")
+                    fields |= {option_name(name) for name in FIELD.findall(source)}
         near = difflib.get_close_matches(re.sub("^--no-", "--", unknown), fields.union(known), n=1, cutoff=0.8)
         return not fields.difference(known).isdisjoint(near)
 

@@ -45,7 +45,13 @@ def run_doctor(json: Json = False) -> None:
         for name in metadata("bidnerf").get_all("Provides-Extra") or ()
         if name != "all"
     }
-    plugins = [info for group in GROUPS for info in list_plugins(group) if not info.is_bundled or info.fault]
+    plugins = list[str]()
+    for group, noun in GROUPS.items():
+        try:
+            listed = [info for info in list_plugins(group) if not info.is_bundled or info.fault]
+            plugins += [f"{noun} {info.name}: {info.description}" for info in listed]
+        except InputError as error:  # such as a table that cannot be imported
+            plugins.append(f"{group}: {error}")
     found: dict[str, Any] = {
         "bidnerf": version("bidnerf"),
         "python": platform.python_version(),
@@ -53,7 +59,7 @@ def run_doctor(json: Json = False) -> None:
         "devices": [] if broken else _devices(),
         "packages": {requirement.name: requirement.installed for requirement in needed},
         "extras": {name: not unmet for name, unmet in extras.items()},
-        "plugins": [f"{GROUPS[info.group]} {info.name}: {info.description}" for info in plugins],
+        "plugins": plugins,
     }
     if json:
         print_json(found)
@@ -68,9 +74,11 @@ def run_doctor(json: Json = False) -> None:
 
 
 def _devices() -> list[str]:
-    """Return the devices on which fields can compute, with the names of GPUs."""
-    import torch
-
+    """Return the devices on which fields can compute, with the names of GPUs, or the reason why torch cannot be used."""
+    try:
+        import torch
+    except (ImportError, OSError) as error:  # OSError: a shared library is missing
+        return [f"torch cannot be imported ({' '.join(str(error).split())})"]
     gpus = [f"cuda:{i}, {torch.cuda.get_device_name(i)}" for i in range(torch.cuda.device_count())]
     return ["cpu", *gpus, *(["mps"] if torch.backends.mps.is_available() else [])]
 

@@ -65,11 +65,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (InputError, ImportError, AttributeError, TypeError) as error:
         # An unsupported version of a package shows as one of these, or as a plugin that cannot be imported for one of them.
         if not isinstance(error, InputError) or isinstance(error.__cause__, ImportError | AttributeError | TypeError):
-            from bidnerf_core.installation import requirements
+            with contextlib.suppress(ImportError):  # bidnerf itself is not installed, but runs from its source
+                from bidnerf_core.installation import requirements
 
-            for requirement in requirements():
-                if not requirement.is_met:
-                    return _report(name, f"{requirement}; pip install -U bidnerf ({error})", BAD_DATA)
+                for requirement in requirements():
+                    if not requirement.is_met:
+                        return _report(name, f"{requirement}; pip install -U bidnerf ({error})", BAD_DATA)
         if not isinstance(error, InputError):
             raise
         return _report(name, str(error), WRONG_USAGE if isinstance(error, UsageError) else BAD_DATA)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from bidnerf import service, viewer
 from bidnerf.cli.options import (
@@ -30,9 +30,6 @@ from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.installation import import_extra
 from bidnerf_core.io import read_file
 from bidnerf_core.registry import USUAL_METHOD
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True)

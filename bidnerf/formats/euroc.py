@@ -38,7 +38,7 @@ EXPECTED_SENSOR = "EuRoC's sensor.yaml"
 def _read(path: Path, root: Path, options: DatasetOptions) -> Capture:
     """Read the lists. Raises ``InputError`` if one is missing or invalid."""
     truth = first_file(root, *(f"{name}/data.csv" for name in TRUTHS))
-    rows = read_timed_files(root / "cam0" / "data.csv")
+    rows = read_timed_files(root / "cam0" / "data.csv", nanoseconds=True)
     camera, T_body_camera = _sensor(root / "cam0" / "sensor.yaml", options)
     trajectory = None if truth is None else read_trajectory(truth)
     shots = list[Shot]()

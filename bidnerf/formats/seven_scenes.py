@@ -51,6 +51,7 @@ T_COLOUR_DEPTH = SE3(
 """Pose of another Kinect's depth camera in its colour camera's frame, as used by ACE's ``setup_7scenes.py``:
 https://projet.liris.cnrs.fr/voir/activities-dataset/kinect-calibration.html."""
 
+SEQUENCE = re.compile(r"seq(?:uence)?-?0*(\d+)", re.IGNORECASE)
 SEVEN_SCENES = Layout(
     (("seq*[0-9]",), (".",)),
     image=r"(frame-\d+)\.color\.(?:png|jpe?g)",
@@ -77,7 +78,7 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
         if not rows:
             raise InputError("lists no sequences", where=file, expected="lines such as sequence1")
         for row in rows:
-            match = re.fullmatch(r"seq(?:uence)?-?0*(\d+)", row.text, re.IGNORECASE)
+            match = SEQUENCE.fullmatch(row.text)
             if match is None:
                 raise row.error(f": {row.text[:40]!r}")
             number = int(match[1])
@@ -99,10 +100,16 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
     )
 
 
+def _images_of_sequences(path: Path) -> list[Path]:
+    """Return the images of the folder or of its sequences, but of no other folder, such as seq-01_old2."""
+    images = SEVEN_SCENES.images(path)
+    return [image for image in images if image.parent == path or SEQUENCE.fullmatch(image.parent.name)]
+
+
 reader = Format(
     "7-Scenes: splits of TrainSplit.txt and TestSplit.txt, depth registered to the colour camera",
     "frame-000000.color.png ... in the folder or in seq-01 ... (7-Scenes)",
-    SEVEN_SCENES.images,
+    _images_of_sequences,
     _read,
     ("camera", "register_depth", "depth_unit"),
     may_lack_poses=True,

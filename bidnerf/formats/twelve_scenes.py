@@ -24,7 +24,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.io import read_file, read_rows
 
 TWELVE_SCENES = replace(
-    SEVEN_SCENES, folders=(("data",), (".",)), camera=("../info.txt", "../_info.txt", "info.txt", "_info.txt")
+    SEVEN_SCENES, folders=(("data",), (".",)), camera=("info.txt", "_info.txt", "../info.txt", "../_info.txt")
 )
 
 

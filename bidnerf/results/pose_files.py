@@ -159,7 +159,8 @@ def write_pose_json(path: Path, images: Sequence[PosedImage]) -> None:
             key: None if m is None or not bool(m.isfinite().all()) else m.double().cpu().tolist()
             for key, m in matrices.items()
         }
-        entries.append(json.dumps({"frame": image.name, "time": image.time, **rows, "unit": image.unit}))
+        entry = {"frame": image.name, "time": image.time, **rows, "unit": image.unit}
+        entries.append(json.dumps(entry, allow_nan=False))
     write_file(path, ("[\n" + ",\n".join(entries) + "\n]\n").encode())
 
 

@@ -38,8 +38,8 @@ by a few millimetres; motion capture that lost its markers leaves longer gaps, i
 KITTI_ROW = 12
 """Numbers in a KITTI row: a 3x4 matrix."""
 NANOSECONDS = 10**9
-LEAST_NANOSECONDS = 10**14
-"""Timestamps from here on are nanoseconds: as seconds, they would be three million years."""
+LEAST_NANOSECONDS = 10**17
+"""Timestamps from here on are nanoseconds, from 1973 on if they count from 1970; those of today in microseconds are a hundredth."""
 LARGEST_SECONDS = 10**11
 """Timestamps between this one and the least in nanoseconds are in no unit that is read: as seconds, they would be millennia."""
 
@@ -120,18 +120,18 @@ def _timed_rows(rows: Sequence[Row], path: Path, columns: str, nanoseconds: bool
         if time >= LEAST_NANOSECONDS or (nanoseconds and stamp.isdecimal()):
             time = (int(stamp) if stamp.isdecimal() else time) / NANOSECONDS
         elif abs(time) > LARGEST_SECONDS:
-            raise row.error(f": {stamp[:60]} is no time in seconds; is it in milliseconds?")
+            raise row.error(f": {stamp[:60]} is no time in seconds; is it in milliseconds or microseconds?")
         timed.append(TimedRow(row, time, words))
     return sorted(timed, key=lambda row: row.time)
 
 
-def read_timed_files(path: Path) -> list[TimedRow]:
-    """Read a list of files with timestamps, in chronological order.
+def read_timed_files(path: Path, nanoseconds: bool = False) -> list[TimedRow]:
+    """Read a list of files with timestamps, in chronological order; integer times are ``nanoseconds`` if that is set.
 
     Raises ``InputError`` if the list is missing, not text, too large or empty, and for a row without a file name, without a
     finite time, or with the time of another row.
     """
-    rows = _timed_rows(read_rows(path, "a list of time stamps", "timestamp filename"), path, "filename")
+    rows = _timed_rows(read_rows(path, "a list of time stamps", "timestamp filename"), path, "filename", nanoseconds)
     for row, following in pairwise(rows):
         if row.time == following.time:
             first, second = sorted((row.row, following.row), key=lambda row: row.line)
@@ -197,11 +197,12 @@ def read_trajectory(path: Path, times: Sequence[float] | None = None) -> Traject
         poses = SE3.stack(read_matrices(path))
         return Trajectory(torch.tensor(times, dtype=torch.float64), poses.rotation, poses.translation)
     comments = [line for line in content.decode("utf-8-sig", "replace").splitlines() if line.lstrip().startswith("#")]
-    timed = _timed_rows(rows, path, POSE, any("[ns]" in line for line in comments))
+    nanoseconds = any("[ns]" in line for line in comments)
+    timed = _timed_rows(rows, path, POSE, nanoseconds)
     # The quaternion order is the one that a comment states, else that of EuRoC or TUM.
     stated = ["".join(re.findall(r"\bq_?(?:\w+_)?([wxyz])\b", line, re.IGNORECASE)).lower() for line in comments]
     stamp, known = _words(rows[0])[0], list[tuple[TimedRow, list[float]]]()
-    is_euroc = "," in rows[0].text and stamp.isdecimal() and int(stamp) >= LEAST_NANOSECONDS
+    is_euroc = "," in rows[0].text and stamp.isdecimal() and (nanoseconds or int(stamp) >= LEAST_NANOSECONDS)
     order = next((named for named in stated if sorted(named) == sorted("xyzw")), "wxyz" if is_euroc else "xyzw")
     for row in timed:
         numbers = pose_numbers(row.row.where, row.row.plain_numbers(row.words[:7]), order)
@@ -268,7 +269,7 @@ def numbers_in(where: object, given: object, count: int) -> list[float]:
     if len(numbers) != count:
         raise InputError(f"has {len(numbers)} numbers", where=where, expected=f"{count}")
     if not all(map(math.isfinite, numbers)):
-        raise InputError(f"{' '.join(words)[:60]!r} is not finite", where=where, expected=f"{count} numbers")
+        raise InputError(f"{' '.join(map(str, words))[:60]!r} is not finite", where=where, expected=f"{count} numbers")
     return numbers
 
 

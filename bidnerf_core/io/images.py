@@ -277,7 +277,7 @@ def open_image(path: ImageSource) -> Iterator[Image.Image]:
     """Open an image file; its pixels are decoded on first use, within the context.
 
     Raises ``InputError`` if there is no such regular file, if it is not readable as an image, and if the
-    image has more pixels than Pillow opens according to its header, before memory is allocated.
+    image has more than ``LARGEST_IMAGE`` pixels according to its header, before memory is allocated.
     """
     raw = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
     if isinstance(path, Path) and path.suffix.lower() in raw:
@@ -297,6 +297,8 @@ def open_image(path: ImageSource) -> Iterator[Image.Image]:
             from PIL import AvifImagePlugin  # noqa: F401
         try:
             with Image.open(file, formats=[name for name in FORMATS if name in Image.OPEN]) as image:
+                if image.width * image.height > LARGEST_IMAGE:  # whatever limit a program set in Pillow
+                    raise Image.DecompressionBombError(f"{image.width * image.height} pixels")
                 yield image
         except InputError:
             raise

@@ -153,6 +153,13 @@ def test_nanoseconds_may_have_a_fraction(tmp_path: Path) -> None:
     assert read_trajectory(tmp_path / "path.txt").times.tolist() == pytest.approx([1403636579.7635556])
 
 
+def test_nanoseconds_that_the_header_states_may_be_of_any_size(tmp_path: Path) -> None:
+    (tmp_path / "path.csv").write_text("#timestamp [ns]\n863636579763555,0,0,0,1,0,0,0\n")  # a device up for ten days
+    found = read_trajectory(tmp_path / "path.csv")
+    assert found.times.tolist() == pytest.approx([863636.579763555])
+    assert torch.equal(found.rotations[0], torch.eye(3, dtype=torch.float64))
+
+
 @pytest.mark.parametrize("kind", TRAJECTORIES)
 def test_trajectories_of_other_kinds(kind: str, folder: Path) -> None:
     frames = [(timed.time, timed.truth) for timed in open_sequence(folder)]

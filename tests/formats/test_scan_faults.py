@@ -361,4 +361,11 @@ def test_depth_of_another_camera_is_registered(views: list[View], tmp_path: Path
 def test_the_frames_of_twelve_scenes_are_a_sequence_without_their_parent(tmp_path: Path) -> None:
     folder = write_twelve_scenes(tmp_path, small_views(4))
     assert len(open_sequence(folder / "data")) == 4
+    text = (
+        (folder / "info.txt").read_text().replace("m_calibrationColorIntrinsic = ", "m_calibrationColorIntrinsic = 9")
+    )
+    (folder / "data/info.txt").write_text(text)
+    here, above = (open_dataset(each).views("test")[0].frame.intrinsics.fx for each in (folder / "data", folder))
+    assert str(here) == f"9{above}"
+    (folder / "data/info.txt").unlink()
     assert open_dataset(folder).frame_names("test") == ["frame-000000", "frame-000001"]

@@ -104,6 +104,8 @@ def test_without_registration_everything_is_as_stored(scene: Path) -> None:
 
 
 def test_splits_and_names(scene: Path) -> None:
+    for name in ("seq-01_old2", "seq-02-2", "seq2x"):
+        write_frame(scene / name, 7)  # no sequence, though its name resembles one
     dataset = open_dataset(scene)
     assert dataset.splits == ("train", "test")
     assert dataset.frame_names("train") == [f"seq-{s}_frame-00000{n}" for s in ("01", "10") for n in range(3)]

@@ -44,9 +44,15 @@ READERS = pytest.mark.parametrize("read", [read_image, read_header], ids=["image
 
 @READERS
 @pytest.mark.parametrize("size", [(13400, 13400), (60000, 60000)])
+@pytest.mark.parametrize("limit", [Image.MAX_IMAGE_PIXELS, None])
 def test_images_of_too_many_pixels_take_no_memory(
-    tmp_path: Path, read: Callable[[Path], object], size: tuple[int, int]
+    tmp_path: Path,
+    read: Callable[[Path], object],
+    size: tuple[int, int],
+    limit: int | None,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", limit)  # None: a program switched Pillow's own check off
     path = tmp_path / "bomb.png"
     path.write_bytes(png_of(*size))
     tracemalloc.start()

@@ -15,7 +15,7 @@ import pytest
 from bidnerf_core import installation
 from bidnerf_core.errors import InputError
 from bidnerf_core.installation import import_extra, requirements, with_writer
-from bidnerf_core.registry import registered
+from bidnerf_core.registry import PluginError, registered
 from bombs import png_of
 from commands import Run, assert_refused, strict
 
@@ -116,12 +116,26 @@ def test_doctor_describes_what_a_bug_report_needs(bidnerf: Run, versions: Callab
     assert re.search(r"torch +2\.4\.1\n(.*\n)*extra video +av 14\.4\.0, expected >=15\n", broken.out)
 
 
+def test_doctor_reports_what_cannot_be_imported(
+    bidnerf: Run, versions: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(group: str) -> Any:
+        raise PluginError(f"{group}.py:TABLE: the table cannot be imported")
+
+    monkeypatch.setattr("bidnerf.cli.plugins.list_plugins", fail)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    found = strict(bidnerf("doctor", "--json").succeed().out)
+    assert found["devices"] == ["torch cannot be imported (import of torch halted; None in sys.modules)"]
+    assert "faults: faults.py:TABLE: the table cannot be imported" in found["plugins"]
+
+
 @pytest.mark.parametrize(
     ("writers", "expected"),
     [
         (["0.3.0"], "a file of bidnerf 0.1.0 or earlier; bidnerf 0.3.0 wrote it, so upgrade bidnerf"),
         (["0.0.9", "0.10"], "a file of bidnerf 0.1.0 or earlier; bidnerf 0.10 wrote it, so upgrade bidnerf"),
-        (["0.1.0", "0.0.9", None, {}], "a map"),
+        (["9" * 5000], f"a file of bidnerf 0.1.0 or earlier; bidnerf {'9' * 40} wrote it, so upgrade bidnerf"),
+        (["0.1.0", "0.1.0rc1", "0.0.9", None, {}], "a map"),
         ([], "a map"),
     ],
 )

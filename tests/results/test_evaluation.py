@@ -60,7 +60,7 @@ def test_normalized_errors_of_an_honest_covariance_are_chi_squared() -> None:
     assert kstest(values.numpy(), chi2(6).cdf).pvalue > 0.01
     for probability in (0.5, 0.95):
         share = float(within(found, true, covariance, probability).double().mean())
-        assert share == pytest.approx(probability, abs=0.03)
+        assert share == pytest.approx(probability, abs=0.02)
     expected = np.einsum("bi,ij,bj->b", drawn.numpy(), np.linalg.inv(covariance.numpy()), drawn.numpy())
     assert values.numpy() == pytest.approx(expected, rel=1e-6)
 

@@ -264,6 +264,15 @@ def test_an_earlier_pose_by_landmarks_is_told_from_the_pose_found(
     assert EARLIER in next(each["note"] for each in there["contests"] if not each["of_pose"])
 
 
+def test_a_localization_is_not_recorded_unless_asked_for(
+    localizer: Localizer, query: Query, answer: Localization, record: SearchRecord
+) -> None:
+    steps = len(record.steps)
+    without = localizer(query.views)
+    assert len(record.steps) == steps > 0
+    assert torch.equal(answer.T_world_camera.matrix(), without.T_world_camera.matrix())
+
+
 def test_the_ellipsoid_is_that_of_two_standard_deviations_in_the_world(generator: torch.Generator) -> None:
     root = torch.randn((6, 6), generator=generator, dtype=torch.float64)
     covariance = root @ root.mT

@@ -216,6 +216,13 @@ def test_the_viewer_describes_itself(client: Client) -> None:
     assert b"degrees from top to bottom" in client.get("/docs").content
 
 
+def test_without_a_token_only_pages_of_this_machine_are_answered(client: Client) -> None:
+    assert client.get("/", Host="evil.example").status_code == 403
+    for origin in ("https://evil.example", f"http://127.0.0.1:{client.port + 1}"):
+        assert client.post("/api/query/0", headers={"Origin": origin}).status_code == 403
+    assert client.get("/").status_code == 200
+
+
 def test_a_token_in_the_address_becomes_a_cookie_that_scripts_cannot_read(room: Map) -> None:
     with serving(room, TOKEN) as client:
         for path in ("/", "/?token=wrong", "/api/thumbnail/0", f"/api/thumbnail/0?token={TOKEN}"):

@@ -12,7 +12,7 @@ from bidnerf_core.datasets.capture import SPLITS, warn_about
 from bidnerf_core.datasets.file_names import posix_name
 from bidnerf_core.datasets.formats.photos import timestamp
 from bidnerf_core.datasets.pose_rows import pose_and_scale
-from bidnerf_core.datasets.trajectories import LEAST_NANOSECONDS, NANOSECONDS
+from bidnerf_core.datasets.trajectories import LARGEST_SECONDS, LEAST_NANOSECONDS, NANOSECONDS
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import IMAGE_SUFFIXES, Record, read_record
@@ -155,9 +155,14 @@ def _depth(record: Record, own: Record) -> tuple[PurePosixPath | None, float]:
 
 
 def _time(own: Record) -> float | None:
-    """Return ``time`` or ``timestamp`` (seconds), or the number in the name of the ``source`` file."""
+    """Return ``time`` or ``timestamp`` (seconds), or the number in the name of the ``source`` file.
+
+    Numbers too large for seconds are nanoseconds; the result is None for those between, whose unit is unknown.
+    """
     for key in ("time", "timestamp"):
         if (found := own.number(key)) is not None:
-            return found / NANOSECONDS if found >= LEAST_NANOSECONDS else found
+            if abs(found) <= LARGEST_SECONDS:
+                return found
+            return found / NANOSECONDS if found >= LEAST_NANOSECONDS else None
     source = own.value("source")
     return timestamp(PurePosixPath(source).stem) if isinstance(source, str) else None
