@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import math
 import os
 import re
 from collections.abc import Callable, Sequence
@@ -56,6 +57,10 @@ class PosedImage:
     orientation: Orientation | None = None  # how the stored image was turned upright; None: according to EXIF
     matches: LandmarkMatches | None = None
     interval: float = 1.0  # seconds between images, assumed where there are no times
+
+    def __post_init__(self) -> None:
+        if self.time is not None and not math.isfinite(self.time):
+            raise InputError(f"the time of {self.name} is {self.time}", expected="seconds, or None if it is unknown")
 
     @property
     def pose(self) -> SE3:

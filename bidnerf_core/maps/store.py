@@ -252,12 +252,17 @@ class Checkpoints:
             self.save(TrainingState(self._step, field.state_dict(), {}))
 
 
-def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingState:
-    """Return the state from which to resume the training of ``field``. Raises ``InputError`` if training is complete."""
+def load_state(
+    folder: Path, info: MapInfo, field: RadianceField, optimizer: dict[str, Tensor] | None = None
+) -> TrainingState:
+    """Return the state from which to resume the training of ``field``, reading that of the ``optimizer`` unless it is given.
+
+    Raises ``InputError`` if training is complete.
+    """
     if info.training is None:
         raise InputError(f"training is complete ({amount(info.step, 'step')}), nothing to resume", where=folder)
     weights = check_weights(trained_field(field), read_part(folder, info, "weights"), folder / info.weights)
-    return TrainingState(info.step, weights, read_part(folder, info, "training"))
+    return TrainingState(info.step, weights, optimizer or read_part(folder, info, "training"))
 
 
 def read_part(folder: Path, info: MapInfo, part: str) -> Any:

@@ -292,8 +292,10 @@ def resume(
         read, views = views_again(info, posed, images, options.depth_points, options.point_choice, out)
         _check_same_views(out, info, read, images.split)
         # These are the keypoints and views with which training began.
-        labels = (read_part(out, info, "training") or {}).get(TRACKS)
-        tracked, views = track_landmarks(views, info.landmark_features, True, read.depth_unit, labels)
+        optimizer = dict[str, Tensor]()
+        with contextlib.suppress(*([InputError] if finish else [])):  # a map that is finished needs no such state
+            optimizer = read_part(out, info, "training") or {}
+        tracked, views = track_landmarks(views, info.landmark_features, True, read.depth_unit, optimizer.get(TRACKS))
         if info.complete or finish:
             scene = load_map(out, device)
             if not info.complete:
@@ -304,7 +306,7 @@ def resume(
             return _complete(scene, views, tracked, options, baking, out=out)
         scene, state = Map(info, NoField(), None, read_part(out, info, "landmarks"), out), None
         if info.step:
-            state = load_state(out, info, build_field(info, str(out)))
+            state = load_state(out, info, build_field(info, str(out)), optimizer)
             log.info(f"{out}: resuming from step {info.step}")
         return _complete(scene, views, tracked, options, baking, state, out)
 

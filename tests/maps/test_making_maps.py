@@ -129,8 +129,10 @@ def test_cancelled_and_resumed_equals_uninterrupted(whole: bn.Map, tmp_path: Pat
         bn.resume(tmp_path / "half", tiny.views())
 
 
-@pytest.mark.parametrize("stage", ["training", "baking"])
-def test_what_was_finished_is_kept_when_a_stage_is_cancelled_and_finish_ends_it(stage: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("stage", "damaged"), [("training", False), ("training", True), ("baking", False)])
+def test_what_was_finished_is_kept_when_a_stage_is_cancelled_and_finish_ends_it(
+    stage: str, damaged: bool, tmp_path: Path
+) -> None:
     out, views = tmp_path / "map", [replace(v, frame=v.frame.replace(depth=None)) for v in training_views()]
     with pytest.raises(bn.Cancelled) as stopped:
         bn.train(views, out=out, config=tiny.config(), bake=BAKE, **stopping_at(stage))
@@ -140,10 +142,14 @@ def test_what_was_finished_is_kept_when_a_stage_is_cancelled_and_finish_ends_it(
     else:
         assert 0 < half.info.step < tiny.STEPS
         assert bn.Localizer(half, warm_up=False)(unseen().frame).converged
+    if damaged:
+        (out / require(half.info.training)).write_bytes(b"damaged")
+        with refused(where=out / require(half.info.training)):
+            bn.resume(out, views, bake=BAKE)
     progress = list[Progress]()
     done = bn.resume(out, views, bake=BAKE, finish=True, progress=progress.append)
     matched = [now for now in progress if now.stage == "landmarks" and now.total > len(views)]
-    assert (len(matched) > 0) == (stage == "baking")  # the matches are kept until the field is complete
+    assert (len(matched) > 0) == (stage == "baking" or damaged)  # the matches are kept until the field is complete
     assert (done.info.complete, done.info.step) == (True, half.info.step)
     assert torch.equal(require(done.landmarks).positions, require(half.landmarks).positions)
     with refused(found="nothing to resume"):

@@ -204,6 +204,8 @@ def test_a_pose_that_is_not_finite_is_refused_where_a_format_has_no_null(tmp_pat
     image = PosedImage("a", 0, CAMERA, SE3(T.rotation, T.translation * math.nan))
     with refused(found="the pose of a is not finite", expected="a .json file"):
         bn.write_poses(tmp_path / name, [image])
+    with refused(found="the time of a is nan", expected="seconds, or None if it is unknown"):
+        replace(image, time=math.nan)
     bn.write_poses(tmp_path / "poses.json", [image])
     assert json.loads((tmp_path / "poses.json").read_text())[0]["T_world_camera"] is None
 

@@ -63,15 +63,25 @@ def test_no_file_outside_of_the_folder_is_opened(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("material", "missing"),
-    [(None, "own.mtl"), ("map_Kd lost.png", "lost.png"), ("map_Kd -clamp on lost.png", "lost.png")],
+    ("libraries", "material", "fault"),
+    [
+        ("own.mtl", None, "own.mtl, its material or texture, is missing"),
+        ("own.mtl", "map_Kd lost.png", "lost.png, its material or texture, is missing"),
+        ("own.mtl", "\tmap_kd\tlost.png", "lost.png, its material or texture, is missing"),
+        ("own.mtl", "map_Kd -clamp on lost.png", "lost.png, its material or texture, is missing"),
+        ("own.mtl", "map_Kd -s 1 1 1 a.obj", "'-s 1 1 1 a.obj', several materials or a texture with options"),
+        ("own.mtl b.mtl", "", "b.mtl, its material or texture, is missing"),
+        ("own.mtl own.mtl", "", "'own.mtl own.mtl', several materials or a texture with options"),
+    ],
 )
-def test_an_obj_without_its_material_has_no_colours(material: str | None, missing: str, tmp_path: Path) -> None:
+def test_an_obj_without_its_material_has_no_colours(
+    libraries: str, material: str | None, fault: str, tmp_path: Path
+) -> None:
     corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
-    (tmp_path / "a.obj").write_text(f"mtllib own.mtl\n{corners}")
+    (tmp_path / "a.obj").write_text(f"mtllib {libraries}\n{corners}")
     if material is not None:
         (tmp_path / "own.mtl").write_text(f"newmtl m\nKd 1 1 1\n{material}\n")
-    with pytest.warns(InputWarning, match=f"{missing}, its material or texture, is missing"):
+    with pytest.warns(InputWarning, match=f"a.obj: {fault}.*, so it is read without colours"):
         scan = read_scan(tmp_path / "a.obj")
     assert (scan.rgb, len(scan.images)) == (None, 0)
 
