@@ -171,9 +171,9 @@ def run_train(
     from bidnerf_core.maps import DESCRIPTION, OtherSettings, TrainOptions, resume, train
 
     resumes, bake = training.resume or training.finish, not target.no_bake
-    if resumes and (target.overwrite or training.quick):
-        names = "--resume" if training.resume else "--finish", "--overwrite" if target.overwrite else "--quick"
-        raise UsageError("{} continues a map, {} starts a new one; expected only one of them".format(*names))
+    if resumes and target.overwrite:
+        name = "--resume" if training.resume else "--finish"
+        raise UsageError(f"{name} continues a map, --overwrite starts a new one; expected only one of them")
     if training.finish and not bake:
         raise UsageError("--finish bakes the map, --no-bake does not; expected only one of them")
     if images.background is not None:

@@ -126,9 +126,10 @@ def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
             f"{enumeration([each for each, _ in able])} can each read it; choose one of them (`importer`)", where=path
         )
     known = "; ".join(f"{each} reads {importer.summary}" for each, importer in found)
-    absent = [f"bidnerf-{each} for {what}" for each, what in OFFERED.items() if each not in IMPORTERS]
+    absent = [f"./plugins/bidnerf-{each} for {what}" for each, what in OFFERED.items() if each not in IMPORTERS]
     raise InputError(
-        f"no installed importer recognizes it ({known})" + (f"; pip install {enumeration(absent)}" if absent else ""),
+        f"no installed importer recognizes it ({known})"
+        + (f"; in a clone of bidnerf, pip install {enumeration(absent)}" if absent else ""),
         where=path,
     )
 

@@ -141,7 +141,9 @@ def test_who_reads_a_file(file: Path, tmp_path: Path, monkeypatch: pytest.Monkey
         importer_of(tmp_path / "a.txt")
     assert importer_of(tmp_path / "a.txt", "tiny")[0] == "tiny"
     monkeypatch.setattr("bidnerf_core.maps.importers.OFFERED", {"tiny": "tiny files", "absent": "splats"})
-    with refused(where=tmp_path / "a.txt", found="); pip install bidnerf-absent for splats"):
+    with refused(
+        where=tmp_path / "a.txt", found="); in a clone of bidnerf, pip install ./plugins/bidnerf-absent for splats"
+    ):
         importer_of(tmp_path / "a.txt")
     pointer = tmp_path / "scene.ply"
     pointer.write_text("version https://git-lfs.github.com/spec/v1\n")
