@@ -20,9 +20,9 @@ from bidnerf.cli.parser import FLAG, Group, Option, SettingsGroup, Without, pars
 from bidnerf.evaluation import PROTOCOLS
 from bidnerf_core.errors import UsageError
 from bidnerf_core.localization import METHODS
-from bidnerf_core.registry import list_plugins
+from bidnerf_core.registry import PluginInfo, list_plugins
 from bidnerf_core.settings import EXPERT, Settings
-from commands import Run
+from commands import Run, assert_refused
 
 if TYPE_CHECKING:
     from decimal import Decimal
@@ -301,3 +301,17 @@ def test_values_are_refused_before_settings_are_loaded() -> None:
     for words in (["here", "--out", "x", "--size", "a"], ["here"]):
         with pytest.raises(UsageError, match=r"--size is 'a', expected a number|required: --where, --out"):
             parse("x", command, words)
+
+
+@pytest.mark.parametrize("package", ["namespace/part.py", "compiled.so"])
+def test_an_unknown_option_is_named_whatever_packages_plugins_consist_of(
+    package: str, bidnerf: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / package
+    file.parent.mkdir(exist_ok=True)
+    file.write_bytes(b"\x7fELF\xff\xfe")
+    name = package.partition("/")[0].removesuffix(".so")
+    monkeypatch.syspath_prepend(tmp_path)
+    plugin = PluginInfo("methods", "other", f"{name}:Method", "other", "1")
+    monkeypatch.setattr("bidnerf.cli.parser.list_plugins", lambda group: [plugin])
+    assert_refused(bidnerf("localize", "map", "a.jpg", "--nonsense"), 2, "no option '--nonsense'")

@@ -6,7 +6,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import imageio.v3 as iio
 import numpy as np
@@ -16,15 +16,17 @@ import torch
 import tiny
 from bidnerf import SE3, Localizer
 
-# Inside: the starts of --perturb, without a localization of each
+# Inside: the starts of --perturb and the arguments QUERY, without a localization of each
 from bidnerf.cli.localize import StartOptions
+from bidnerf.cli.options import QueryOptions
 from bidnerf.results import pose_error
 from bidnerf.testing import unseen
-from bidnerf_core.datasets import Photos, Query, open_dataset
-from bidnerf_core.errors import printable
+from bidnerf_core.datasets import DatasetOptions, Photos, Query, open_dataset
+from bidnerf_core.errors import InputError, printable
 from bidnerf_core.localization import Outcome
 from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.maps import load_info
+from bombs import png_of
 from commands import Run, assert_refused
 
 FOCAL = ["--focal", tiny.CAMERA.fx]
@@ -247,3 +249,18 @@ def test_names_cannot_control_the_terminal(bidnerf: Run, map_folder: Path, tmp_p
         _, said, err = bidnerf(*words)
         assert "\x1b" not in said + err
         assert "\\x1b" in said + err
+
+
+def test_a_photo_that_cannot_be_opened_does_not_stop_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = [tmp_path / "a.png", tmp_path / "b.png"]
+    for file in files:
+        file.write_bytes(png_of(64, 48))
+
+    def deny(path: Path, what: str) -> NoReturn:
+        raise InputError("permission denied", where=path)
+
+    monkeypatch.setattr("bidnerf_core.io.open_binary", deny)
+    photos = QueryOptions().opener(files, DatasetOptions())([], None)
+    assert list(photos.names) == ["a", "b"]

@@ -182,6 +182,14 @@ def test_permission_that_is_denied_is_named(tmp_path: Path, monkeypatch: pytest.
         read_image(path)
 
 
+def test_heic_without_its_package_names_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    path = tmp_path / "IMG_1.jpg"  # the content counts, not the name
+    path.write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic")
+    with refused(where=path, found="pip install 'bidnerf[heif]'"):
+        read_image(path)
+
+
 FOREIGN = {
     "eps": b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 24 24\n%%EndComments\n{} loop\n",
     "psd": b"8BPS\x00\x01" + bytes(6) + struct.pack(">HIIHH", 3, 8, 8, 8, 3) + bytes(40),

@@ -6,7 +6,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
-from importlib.metadata import metadata
+from importlib.metadata import PackageNotFoundError, metadata
 from pathlib import Path
 from typing import Any
 
@@ -96,10 +96,18 @@ def test_an_old_dependency_explains_the_failure_that_it_causes(
         """Fail as code does whose dependency is old."""
         raise error
 
+    def missing(name: str) -> None:
+        raise PackageNotFoundError(name)
+
     with monkeypatch.context() as context:
         context.setitem(registered, ("commands", "fail"), fail)
         with pytest.raises(type(error)):  # a defect, if all requirements are met
             bidnerf("fail")
+        with context.context() as source:
+            source.setattr(installation, "requires", missing)
+            requirements.cache_clear()
+            with pytest.raises(type(error), match=re.escape(str(error))):  # bidnerf runs from its source
+                bidnerf("fail")
         versions(torch="2.4.1")
         assert_refused(bidnerf("fail"), 1, "torch 2.4.1, expected >=2.6; pip install -U bidnerf", error)
 
