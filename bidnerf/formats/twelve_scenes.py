@@ -24,13 +24,14 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.io import read_file, read_rows
 
 TWELVE_SCENES = replace(
-    SEVEN_SCENES, folders=(("data",), (".",)), camera=("info.txt", "_info.txt", "../info.txt", "../_info.txt")
+    SEVEN_SCENES, folders=(("data",), (".",)), camera=("../info.txt", "../_info.txt", "info.txt", "_info.txt")
 )
 
 
 def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
     """Read the poses and splits. Raises ``InputError`` if a metadata file is invalid."""
-    info, values = TWELVE_SCENES.file(TWELVE_SCENES.camera, images[0]), dict[str, list[float]]()
+    own, values = first_file(path, "info.txt", "_info.txt"), dict[str, list[float]]()
+    info = own or TWELVE_SCENES.file(TWELVE_SCENES.camera, images[0])
     for row in read_rows(info, "12-Scenes' info.txt", "name = numbers"):
         name, _, text = row.text.partition("=")
         if name.strip().startswith(("m_calibration", "m_color", "m_depth")):
