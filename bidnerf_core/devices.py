@@ -13,7 +13,7 @@ from contextvars import ContextVar
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from threading import Lock
-from typing import Any, Self, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import torch
 from jaxtyping import Shaped
@@ -23,6 +23,7 @@ from torch.utils._pytree import tree_leaves
 from bidnerf_core.errors import InputError
 
 T = TypeVar("T")
+Rows = TypeVar("Rows", bound="TensorRows")
 
 
 # Constants as tensors. Each is created once per device, since its creation copies data from the host to the device.
@@ -282,11 +283,11 @@ class TensorRows:
     def __len__(self) -> int:
         return len(next(iter(vars(self).values())))
 
-    def __getitem__(self, index: Tensor | slice | None) -> Self:
+    def __getitem__(self: Rows, index: Tensor | slice | None) -> Rows:
         """Select rows by an index along the first axis or by a mask; None adds an axis of length 1."""
         return self.map(lambda part: part[index])
 
-    def map(self, change: Callable[[Tensor], Tensor]) -> Self:
+    def map(self: Rows, change: Callable[[Tensor], Tensor]) -> Rows:
         """Return the object with ``change`` applied to each tensor."""
         return type(self)(*(change(part) for part in vars(self).values()))
 

@@ -168,7 +168,7 @@ def test_samples_are_those_of_torch(
     aims = 0.7 * torch.randn((RAYS, 3), generator=generator)
     rays = grid.bounds.rays(origins.to(DEVICE), normalize(aims - origins, dim=-1).to(DEVICE))
     monkeypatch.setattr("bidnerf_hashgrid.occupancy.may_wait", lambda device: False)
-    monkeypatch.setattr("bidnerf_core.fields.sampling.may_wait", lambda device: False)
+    monkeypatch.setattr("bidnerf_hashgrid.concentration.may_wait", lambda device: False)
     sampler = grid if count == MOST else ConcentratedInGrid(GridDensity(grid), count)
 
     def sampled() -> RaySamples:

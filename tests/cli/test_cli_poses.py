@@ -130,7 +130,7 @@ def prepare_views(views: list[View], points: Points, monkeypatch: pytest.MonkeyP
     """Prepare views of points for training, as the command does."""
     monkeypatch.setattr(
         "bidnerf_core.captures.training_views.track_views",
-        lambda given, features: track_views(given, points),
+        lambda given, features, **options: track_views(given, points, **options),
     )
     prepared_for_training(views)
 

@@ -13,6 +13,7 @@ from concurrent.futures import Future
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import imageio.v3 as iio
 import numpy as np
@@ -45,6 +46,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.io import from_plain
 from bidnerf_core.localization import find_method
 from bidnerf_core.progress import Progress
+from bidnerf_core.registry import registered
 from optional import require
 from refusals import refused
 from trial_results import timeless
@@ -145,10 +147,10 @@ def test_results_of_another_map_in_memory_are_not_taken_for_its_own(tmp_path: Pa
         bn.evaluate(second, **given)
 
 
+@patch.dict(registered, clear=True)
 def test_what_this_process_alone_has_registered_is_not_mistaken_for_what_is_installed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("bidnerf_core.registry.registered", {})
     mine = dataclasses.replace(find_method("bid"), summary="mine")
     bn.register("methods", "bid", mine, replace=True)
     bn.register("methods", "unused", mine)
@@ -158,8 +160,7 @@ def test_what_this_process_alone_has_registered_is_not_mistaken_for_what_is_inst
         """What another process does: it gets copies, and nothing is registered there."""
 
         def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-            with pytest.MonkeyPatch.context() as patch:
-                patch.setattr("bidnerf_core.registry.registered", {})
+            with patch.dict(registered, clear=True):
                 return super().submit(*pickle.loads(pickle.dumps((fn, *args))), **kwargs)
 
     monkeypatch.setattr("bidnerf.evaluation.run.local_processes", lambda count: Elsewhere())
