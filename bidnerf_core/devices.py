@@ -23,7 +23,7 @@ from torch.utils._pytree import tree_leaves
 from bidnerf_core.errors import InputError
 
 T = TypeVar("T")
-Rows = TypeVar("Rows", bound="TensorRows")
+_Rows = TypeVar("_Rows", bound="TensorRows")
 
 
 # Constants as tensors. Each is created once per device, since its creation copies data from the host to the device.
@@ -283,11 +283,11 @@ class TensorRows:
     def __len__(self) -> int:
         return len(next(iter(vars(self).values())))
 
-    def __getitem__(self: Rows, index: Tensor | slice | None) -> Rows:
+    def __getitem__(self: _Rows, index: Tensor | slice | None) -> _Rows:
         """Select rows by an index along the first axis or by a mask; None adds an axis of length 1."""
         return self.map(lambda part: part[index])
 
-    def map(self: Rows, change: Callable[[Tensor], Tensor]) -> Rows:
+    def map(self: _Rows, change: Callable[[Tensor], Tensor]) -> _Rows:
         """Return the object with ``change`` applied to each tensor."""
         return type(self)(*(change(part) for part in vars(self).values()))
 
