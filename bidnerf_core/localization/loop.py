@@ -218,7 +218,8 @@ class Loop:
             loss[g] = replace(rays, sights=rays.sights.mirrored).loss_at(fit.likeliest[g : g + 1])[0]
         # Neighbouring rays share the field's errors, which the scatter of the rays' gradients does not show; it shows even
         # less of the errors of rays that agree less than usual, and of a camera that rays determine together with the pose.
-        # The power and the factor make 95 % of the poses on record lie inside the bound of their covariance.
+        # The power and the factor were chosen on answers of objects; on record (``answers_halves``), 511 of 586 accepted poses lie inside
+        # the 95 % bound of their covariance.
         trial, states = self.landmarks.trial, fit.states
         difference = loss / trial.difference if trial.difference > 0 else torch.full_like(loss, torch.nan)
         factor = trial.rays * difference.nan_to_num(1.0).clamp(min=1.0).pow(6)[states.mode]

@@ -208,7 +208,7 @@ def test_a_risk_that_was_not_calibrated_is_refused(risk: Any) -> None:
 
 @pytest.mark.parametrize(("tolerance", "accepted"), [(0.05, True), (0.02, False), (None, True)])
 def test_a_tolerance_rejects_what_is_less_certain(tolerance: float | None, accepted: bool) -> None:
-    """Of a Gaussian of 0.015 along each axis, 99 % lie within 0.05, and 38 % within 0.02."""
+    """A Gaussian of 0.015 along each axis has 99 % of its mass within 0.05, and 38 % within 0.02."""
     covariance = torch.diag(torch.tensor([0.015] * 3 + [0.001] * 3, dtype=torch.float64).square())
     found = within_limits(replace(answer(), covariance=covariance), AutoConfig(tolerance=tolerance))
     assert found.converged is accepted
