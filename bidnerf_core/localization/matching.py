@@ -20,7 +20,9 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import (
+    FEW_DESCRIPTORS,
     CachedFeatures,
+    DescriptorCells,
     Features,
     HalfPrecisionSearch,
     ImageKeypoints,
@@ -149,25 +151,26 @@ OCTAVES, OBLIQUE = 1.0, math.radians(40)
 class LandmarkMatcher:
     """Finds the landmarks whose descriptors are nearest to given keypoint descriptors.
 
-    Above a few thousand landmarks, it uses an inverted file: k-means divides the landmarks into sqrt(n) cells (more in large maps), and
-    only the cells nearest to a keypoint are searched (Sivic and Zisserman 2003; Jegou et al. 2011). Threads may share a matcher. The
-    matcher also computes ``LandmarkMap.cells`` for matching by projection.
+    Above a few thousand landmarks, it uses an inverted file: only the ``LandmarkMap.descriptor_cells`` nearest to a keypoint are searched
+    (Sivic and Zisserman 2003; Jegou et al. 2011). Threads may share a matcher. The matcher also computes ``LandmarkMap.cells`` for
+    matching by projection.
 
     Descriptors are compared on the device of the descriptors of ``landmarks``; all other computations with landmarks run on the CPU. On an
     accelerator the search is always exhaustive.
     """
 
-    def __init__(self, landmarks: LandmarkMap, seed: int = 0) -> None:
+    def __init__(self, landmarks: LandmarkMap) -> None:
         self.landmarks = landmarks.to("cpu")
         _ = self.landmarks.cells  # computed now and cached, as threads may share the matcher
         self._descriptors = landmarks.descriptors
         self._cached_features: CachedFeatures | None = None  # see ``for_query``
-        # None: the search is exhaustive, as it is for up to 4,000 landmarks.
+        # None: the search is exhaustive.
         self._index: HalfPrecisionSearch | InvertedFile | None = None
         if self.device.type != "cpu":
             self._index = HalfPrecisionSearch(landmarks.descriptors)
-        elif len(landmarks) > 4_000:
-            self._index = InvertedFile(landmarks.descriptors, seed)
+        elif len(landmarks) > FEW_DESCRIPTORS:
+            cells = landmarks.descriptor_cells or DescriptorCells.of(landmarks.descriptors)
+            self._index = InvertedFile(landmarks.descriptors, cells)
 
     @property
     def device(self) -> torch.device:

@@ -15,6 +15,8 @@ from .landmarks.building import pose_updates as pose_updates
 from .landmarks.building import robust_covariance as robust_covariance
 from .landmarks.building import track_views as track_views
 from .landmarks.building import update_scatter as update_scatter
+from .landmarks.descriptors import FEW_DESCRIPTORS as FEW_DESCRIPTORS
+from .landmarks.descriptors import DescriptorCells as DescriptorCells
 from .landmarks.descriptors import HalfPrecisionSearch as HalfPrecisionSearch
 from .landmarks.descriptors import InvertedFile as InvertedFile
 from .landmarks.descriptors import byte_of_zero as byte_of_zero

@@ -14,6 +14,7 @@ from torch import Tensor
 from bidnerf_core.fields import LARGEST_LENGTH, VoxelGrid
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import COLOUR_ROUNDING, TensorKind, check_tensors, pack_tensors
+from bidnerf_core.mapping.landmarks.descriptors import DescriptorCells
 from bidnerf_core.mapping.landmarks.landmark_map import HeldOutTrial, LandmarkMap, Tracks
 from bidnerf_core.mapping.surface.surface_map import SurfaceMap, Surfels
 from bidnerf_core.mapping.surface.surfel_index import CELLS_OF_BLOCK, COARSER_FROM, SurfelIndex, block_shape
@@ -55,6 +56,11 @@ TRACK_KINDS = {
     "track_pixel": TensorKind("m 2"),
 }
 """Optional: earlier versions stored no tracks."""
+CELL_KINDS = {
+    "cell_centres": TensorKind("C D"),
+    "cell": TensorKind("n", torch.int32, index_of="C"),
+}
+"""Optional: few landmarks have none, and earlier versions stored none."""
 
 
 def surface_tensors(surface: SurfaceMap) -> dict[str, Tensor]:
@@ -102,6 +108,8 @@ def landmark_tensors(landmarks: LandmarkMap) -> dict[str, Tensor]:
     if (tracks := landmarks.tracks) is not None:
         parts = (tracks.landmark, tracks.image, tracks.pixel)
         copies |= _copies(dict(zip(TRACK_KINDS, parts, strict=True)), TRACK_KINDS)
+    if (cells := landmarks.descriptor_cells) is not None:
+        copies |= _copies({"cell_centres": cells.centres, "cell": cells.cell}, CELL_KINDS)
     return copies
 
 
@@ -110,8 +118,8 @@ def landmarks_from_tensors(tensors: dict[str, Tensor]) -> LandmarkMap:
 
     Raises ``KeyError`` for a missing tensor, ``ValueError`` for one with the wrong shape, dtype or content.
     """
-    tracks = TRACK_KINDS if TRACK_KINDS.keys() <= tensors.keys() else {}
-    check_tensors(tensors, LANDMARK_KINDS | tracks)
+    tracks, cells = (kinds if kinds.keys() <= tensors.keys() else {} for kinds in (TRACK_KINDS, CELL_KINDS))
+    check_tensors(tensors, LANDMARK_KINDS | tracks | cells)
     covariance = tensors["pose_covariance"]
     if float((covariance - covariance.mT).abs().max()) > 0 or float(torch.linalg.eigvalsh(covariance)[0]) < 0:
         raise ValueError("pose_covariance is not symmetric and positive semidefinite")
@@ -121,4 +129,6 @@ def landmarks_from_tensors(tensors: dict[str, Tensor]) -> LandmarkMap:
     parts["trial"] = HeldOutTrial(int(images), int(localized), *errors)
     if tracks:
         parts["tracks"] = Tracks(*(tensors[name] for name in tracks))
+    if cells:
+        parts["descriptor_cells"] = DescriptorCells(*(tensors[name] for name in cells))
     return LandmarkMap(**parts)

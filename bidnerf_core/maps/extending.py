@@ -262,7 +262,7 @@ def _extend(
         else:
             own = scene.landmarks
             if own is not None and len(more):
-                more = concatenate([own, more[~_present(own, more)]])
+                more = concatenate([own, more[~_present(own, more)]]).indexed()
             grown = grown.with_parts(None, more if own is None or len(more) else own)
     before, after = (0 if m.landmarks is None else len(m.landmarks) for m in (scene, grown))
     log.info(f"{where}: {before} landmarks before, {after} now; {amount(len(info.cameras), 'image')}")

@@ -81,7 +81,7 @@ def test_few_landmarks_are_compared_exactly() -> None:
 def test_many_landmarks_are_found_by_their_cells() -> None:
     landmarks = many(40_000)
     queries = landmarks.descriptors[::50]
-    distances, index = LandmarkMatcher(landmarks, seed=1).nearest(queries, 2)
+    distances, index = LandmarkMatcher(landmarks).nearest(queries, 2)
     assert float((index[:, 0] == torch.arange(0, 40_000, 50)).float().mean()) > 0.99
     exact = squared_distances(queries, landmarks.descriptors)
     assert torch.equal(exact.gather(1, index), distances)

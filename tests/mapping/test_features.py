@@ -15,6 +15,7 @@ from bidnerf import SE3, Frame, InputError, Intrinsics, View
 from bidnerf_core.mapping import (
     SIFT,
     CachedFeatures,
+    DescriptorCells,
     InvertedFile,
     Keypoints,
     Sift,
@@ -191,7 +192,7 @@ def test_an_inverted_file_selects_once_from_all_cells(
     generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     many = torch.randint(0, 256, (5000, 16), generator=generator, dtype=torch.uint8)
-    index, selections = InvertedFile(many, 0), list[int]()
+    index, selections = InvertedFile(many, DescriptorCells.of(many)), list[int]()
 
     def counted(distances: torch.Tensor, count: int) -> tuple[torch.Tensor, torch.Tensor]:
         selections.append(count)

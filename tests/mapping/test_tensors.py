@@ -18,12 +18,15 @@ from bidnerf_core.mapping import (
     LandmarkMap,
     SurfaceMap,
     build_landmarks,
+    concatenate,
     landmark_tensors,
     landmarks_from_tensors,
+    nearest_centre,
     surface_from_tensors,
     surface_tensors,
 )
 from landmark_scene import Points, ring
+from optional import require
 
 
 @functools.cache
@@ -132,6 +135,46 @@ def test_what_is_broken_is_refused(kind: str, name: str, change: Any, said: str)
     missing = {key: value for key, value in whole.items() if key != name}
     with pytest.raises(KeyError, match=name):
         back(missing)
+
+
+def many_landmarks() -> LandmarkMap:
+    """Return landmarks in the order of the cells of their descriptors, with random descriptors."""
+    drawn = torch.randint(0, 256, (6000, 128), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    return replace(landmarks()[torch.arange(6000) % len(landmarks())], descriptors=drawn, tracks=None).indexed()
+
+
+def test_cells_of_descriptors_are_made_once_and_stored() -> None:
+    made = many_landmarks()
+    stored = landmarks_from_tensors(landmark_tensors(made))
+    found = require(stored.descriptor_cells)
+    assert torch.equal(found.centres, require(made.descriptor_cells).centres)
+    assert torch.equal(found.cell, nearest_centre(made.descriptors, found.centres))
+    assert bool((found.cell.diff() >= 0).all())
+    query = made.descriptors[::97]
+    for here in (
+        stored,
+        replace(stored, descriptor_cells=None),
+    ):  # an earlier version's: cells are made when the map is opened
+        distance, number = LandmarkMatcher(here).nearest(query, 1)
+        assert torch.equal(number[:, 0], torch.arange(0, 6000, 97))
+        assert not distance.any()
+    assert landmarks().indexed() is landmarks()
+
+
+def test_cells_of_descriptors_survive_selection_and_extension() -> None:
+    made = many_landmarks()
+    half, rest = made[torch.arange(0, 6000, 2)], made[torch.arange(1, 6000, 2)]
+    joined = concatenate([half, replace(rest, descriptor_cells=None)])
+    cells = require(joined.descriptor_cells)
+    assert torch.equal(cells.cell, nearest_centre(joined.descriptors, cells.centres))
+    assert torch.equal(LandmarkMatcher(joined).nearest(joined.descriptors[::89], 1)[1][:, 0], torch.arange(0, 6000, 89))
+
+
+@pytest.mark.parametrize(("name", "change"), [("cell", lambda v: v + 1), ("cell_centres", lambda v: v[:, :100])])
+def test_cells_that_do_not_fit_the_descriptors_are_refused(name: str, change: Any) -> None:
+    whole = landmark_tensors(many_landmarks())
+    with pytest.raises(ValueError, match=f"{name} is"):
+        landmarks_from_tensors(whole | {name: change(whole[name])})
 
 
 def test_correlation_grows_with_the_square_root_of_the_matches_where_the_usual_number_is_known() -> None:

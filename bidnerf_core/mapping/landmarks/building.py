@@ -168,7 +168,7 @@ class TrackedViews:
         if len(landmarks) > config.most:
             report(f"{len(landmarks)} landmarks found, {config.most} kept: those seen in the most images")
             landmarks = landmarks[landmarks.views.argsort(descending=True, stable=True)[: config.most].sort().values]
-        return replace(landmarks, moving=moving, features=name)
+        return replace(landmarks, moving=moving, features=name).indexed()
 
     def landmarks_by_image(self, config: LandmarkConfig) -> list[SeenLandmarks]:
         """Return the triangulated landmarks seen in each image; training uses their depth where none was measured."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
@@ -90,8 +91,11 @@ def k_means(descriptors: UInt8[Tensor, "n d"], count: int, generator: torch.Gene
 
 def nearest_centre(descriptors: Tensor, centres: Float[Tensor, "c d"]) -> Int[Tensor, "n"]:
     """Return the index of the centre nearest to each descriptor."""
-    rows = max(1, BLOCK // len(centres))
-    return torch.cat([squared_distances(part, centres).argmin(1) for part in descriptors.split(rows)])
+    nearest = torch.empty(len(descriptors), dtype=torch.long, device=descriptors.device)
+    # Results that are allocated in turn with blocks of distances would fragment the memory.
+    for part, found in zip(*(x.split(max(1, BLOCK // len(centres))) for x in (descriptors, nearest)), strict=True):
+        found.copy_(squared_distances(part, centres).argmin(1))
+    return nearest
 
 
 def smallest(distances: Float[Tensor, "q n"], count: int) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
@@ -126,18 +130,44 @@ class HalfPrecisionSearch:
         return distances.float(), indices
 
 
-class InvertedFile:
-    """An inverted file: descriptors sorted by cells, of which only the nearest are searched (Sivic and Zisserman 2003)."""
+FEW_DESCRIPTORS = 4_000
+"""Number of descriptors up to which all are compared, without cells."""
 
-    def __init__(self, descriptors: UInt8[Tensor, "n d"], seed: int) -> None:
+
+@dataclass(frozen=True, eq=False)
+class DescriptorCells:
+    """A division of descriptors into k-means cells, which is stored with the landmarks of a map."""
+
+    centres: Float[Tensor, "c d"]
+    cell: Int[Tensor, "n"]  # of each descriptor, int32
+
+    @staticmethod
+    def of(descriptors: UInt8[Tensor, "n d"]) -> DescriptorCells:
+        """Divide descriptors into sqrt(n) cells, or more if there are many."""
         # In large maps, cells have 500 landmarks on average, since comparing more would take most of the time.
         count = round(max(math.sqrt(len(descriptors)), len(descriptors) / 500))
-        self._centres = k_means(descriptors, count, torch.Generator().manual_seed(seed))
-        cell = nearest_centre(descriptors, self._centres)
+        centres = k_means(descriptors, count, torch.Generator().manual_seed(0))
+        return DescriptorCells(centres, nearest_centre(descriptors, centres).int())
+
+    def __getitem__(self, index: Tensor | slice) -> DescriptorCells:
+        return DescriptorCells(self.centres, self.cell[index])
+
+
+class InvertedFile:
+    """An inverted file: descriptors sorted by cells, of which only the nearest are searched (Sivic and Zisserman 2003).
+
+    Descriptors that are in the order of their cells are not copied.
+    """
+
+    def __init__(self, descriptors: UInt8[Tensor, "n d"], cells: DescriptorCells) -> None:
+        self._centres, cell = cells.centres, cells.cell
         self._order = cell.argsort(stable=True)
-        self._descriptors = descriptors[self._order]
-        self._squares = torch.cat([part.float().square().sum(-1) for part in self._descriptors.split(BLOCK // 256)])
-        self._first = pad(torch.bincount(cell, minlength=count).cumsum(0), (1, 0))
+        is_sorted = bool((cell.diff() >= 0).all())
+        self._descriptors = descriptors if is_sorted else descriptors[self._order]
+        self._squares = torch.empty(len(descriptors))
+        for part, squares in zip(self._descriptors.split(MANY), self._squares.split(MANY), strict=True):
+            torch.sum(part.float().square_(), -1, out=squares)
+        self._first = pad(torch.bincount(cell, minlength=len(self._centres)).cumsum(0), (1, 0))
 
     def nearest(self, descriptors: UInt8[Tensor, "q d"], count: int) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
         """Return the squared distances and the indices of the nearest landmarks in the twelve cells nearest to each descriptor."""

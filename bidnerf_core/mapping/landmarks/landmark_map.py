@@ -18,7 +18,12 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.devices import move_to, working_device
 from bidnerf_core.geometry import KEYPOINTS_PER_INDEPENDENT, SE3
-from bidnerf_core.mapping.landmarks.descriptors import unrelated_distance
+from bidnerf_core.mapping.landmarks.descriptors import (
+    FEW_DESCRIPTORS,
+    DescriptorCells,
+    nearest_centre,
+    unrelated_distance,
+)
 from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
 
 MOST_IN_CELL = 128
@@ -168,6 +173,7 @@ class LandmarkMap:
     cameras: tuple[Intrinsics, ...] = ()  # of the images, where known
     features: str = USUAL_FEATURES  # name of the detector of the keypoints; "" if it has none
     tracks: Tracks | None = None  # None in maps that earlier versions stored
+    descriptor_cells: DescriptorCells | None = None  # None for few landmarks, and in maps that earlier versions stored
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -180,7 +186,16 @@ class LandmarkMap:
             numbers = torch.full((len(self),), -1, device=there)
             numbers[chosen] = torch.arange(len(chosen), device=there)
             tracks = tracks.renumber(numbers)
-        return replace(self, tracks=tracks, **{name: getattr(self, name)[index] for name in PER_LANDMARK})
+        cells = None if self.descriptor_cells is None else self.descriptor_cells[index]
+        parts = {name: getattr(self, name)[index] for name in PER_LANDMARK}
+        return replace(self, tracks=tracks, descriptor_cells=cells, **parts)
+
+    def indexed(self) -> LandmarkMap:
+        """Return the landmarks in the order of new cells of their descriptors; ``self`` if they are few."""
+        if len(self) <= FEW_DESCRIPTORS:
+            return self
+        cells = DescriptorCells.of(self.descriptors)
+        return replace(self, descriptor_cells=cells)[cells.cell.argsort(stable=True)]
 
     def scaled(self, factor: float) -> LandmarkMap:
         """Return the landmarks with lengths multiplied by ``factor``."""
@@ -251,7 +266,10 @@ PER_LANDMARK = ("positions", "deviations", "descriptors", "directions", "cones",
 
 
 def concatenate(maps: list[LandmarkMap]) -> LandmarkMap:
-    """Return the landmarks of all ``maps`` (descriptors of the same length), with the other fields of the first map."""
+    """Return the landmarks of all ``maps`` (descriptors of the same length), with the other fields of the first map.
+
+    Their descriptors are divided into the cells of the first map, if it has any.
+    """
     joined: dict[str, Any] = {name: torch.cat([getattr(m, name) for m in maps]) for name in PER_LANDMARK}
     firsts = accumulate(map(len, maps), initial=0)
     numbered = [(m.tracks, torch.arange(len(m)) + first) for m, first in zip(maps, firsts, strict=False)]
@@ -259,4 +277,7 @@ def concatenate(maps: list[LandmarkMap]) -> LandmarkMap:
     if tracks:
         parts = (torch.cat([getattr(part, name) for part in tracks]) for name in ("landmark", "image", "pixel"))
         joined["tracks"] = Tracks(*parts)
+    if (cells := maps[0].descriptor_cells) is not None:
+        more = [nearest_centre(m.descriptors, cells.centres).int() for m in maps[1:]]
+        joined["descriptor_cells"] = replace(cells, cell=torch.cat([cells.cell, *more]))
     return replace(maps[0], **joined)
