@@ -25,10 +25,10 @@ unexport PYTHONDONTWRITEBYTECODE
 INSTALL = $(BIN)/python -m pip install --disable-pip-version-check --no-compile -c constraints.txt
 SHOW_LONG = { grep --line-buffered -E 'Downloading .*(MB|GB)|^Installing collected' | cut -c1-100 || true; }
 
-.PHONY: help demo test slow robustness shapes check lint format page types arrows records wheels docs clean
+.PHONY: help demo test slow robustness shapes check lint format page types arrows records release-records wheels docs clean
 
 help: ## this list
-	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/^([a-z]+):[^#]*## /  make \1\t/' | expand -t 18
+	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/^([a-z-]+):[^#]*## /  make \1\t/' | expand -t 18
 
 demo: $(VENV)/.installed-demo ## train a small scene, find poses in it, draw the result in demo-out/
 	@$(BIN)/bidnerf demo --out $(DEMO_OUT) --overwrite
@@ -63,6 +63,10 @@ arrows: $(VENV)/.installed-dev ## which module may import which
 
 records: $(BIN)/pip ## whether the records that the documentation cites are older than what they measure
 	@$(BIN)/python benchmarks/stale.py >/dev/null && echo "records: none is newly out of date"
+
+release-records: $(BIN)/pip ## make the cited records anew that are out of date; may be interrupted; needs BIDNERF_DATA and BIDNERF_MAPS
+	@OMP_NUM_THREADS=1 $(BIN)/python benchmarks/stale.py --make $(ARGS)
+	@$(BIN)/python docs/tables.py
 
 wheels: $(VENV)/.installed-dev ## what is distributed, of bidnerf and of every plugin, in dist/
 	@rm -rf dist
