@@ -59,7 +59,7 @@ INCONSISTENT = 0.25
 refined. Poses from structure from motion or a renderer add less than a tenth of a pixel.
 """
 ROUNDS = 3
-"""Largest number of bundle adjustments. After each one, the keypoints are rematch, which finds matches that
+"""Largest number of bundle adjustments. After each one, the keypoints are matched again, which finds matches that
 wrong poses prevented."""
 MOST_EVIDENCE = 10.0
 """Largest contribution of an image to the log evidence for or against a motion, so that a few images cannot decide."""
@@ -256,7 +256,7 @@ def adjust_poses(
 ) -> tuple[TrackedViews, Float[Tensor, "v"], PoseRefinement] | None:
     """Bundle-adjust the poses and points of the ``tracked`` images; None if there are too few images or points.
 
-    Returns the tracks with the adjusted poses, rematch using these; the median shift (pixels) of the points in each
+    Returns the tracks matched with the adjusted poses; the median shift (pixels) of the points in each
     image, 0 without points; and how well the given and the adjusted poses fit the keypoints.
 
     The errors of the given poses are assumed to be independent, and as large as resection of the images

@@ -283,7 +283,7 @@ def with_images(landmarks: LandmarkMap, info: MapInfo) -> LandmarkMap:
 
 
 def with_tracks_in(info: MapInfo, landmarks: LandmarkMap, names: Sequence[str]) -> LandmarkMap:
-    """Return landmarks that were built from the images ``names``, with tracks renumber to the images of the map."""
+    """Return landmarks that were built from the images ``names``, with tracks renumbered to the images of the map."""
     if landmarks.tracks is None:
         return landmarks
     numbers = {camera.name: number for number, camera in enumerate(info.cameras)}

@@ -17,6 +17,7 @@ from bidnerf_core.mapping import (
     Sift,
     Sightings,
     build_landmarks,
+    image_keypoints,
     likely_pairs,
     robust_covariance,
     track_views,
@@ -26,7 +27,13 @@ from bidnerf_core.mapping import (
 # Inside: triangulation, tracks and cells, each against an exhaustive computation
 from bidnerf_core.mapping.geometry.triangulation import parallax, refine_points, triangulate
 from bidnerf_core.mapping.landmarks.landmark_map import MOST_IN_CELL, LandmarkCells
-from bidnerf_core.mapping.landmarks.tracks import PairMatches, _mean_descriptors, link_tracks
+from bidnerf_core.mapping.landmarks.tracks import (
+    EPIPOLAR_BAND,
+    PairMatches,
+    _mean_descriptors,
+    epipolar_matches,
+    link_tracks,
+)
 from bidnerf_core.progress import Progress, job_context
 from landmark_scene import PINHOLE, Points, looking_in, ring
 from optional import require
@@ -178,6 +185,47 @@ def test_parallax_is_the_angle_between_two_rays() -> None:
     cameras = [looking_in(0.0, 0.0), looking_in(0.2, 0.0)]
     seen = sightings(torch.zeros(3, dtype=torch.float64), cameras, 0.0, 1)
     assert float(parallax(seen, torch.zeros(1, 3, dtype=torch.float64))) == pytest.approx(0.2)
+
+
+def test_matches_near_epipolar_lines_are_those_of_an_exhaustive_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = Points(count=150, noise=1.0)
+    generator = torch.Generator().manual_seed(0)
+
+    def noisy(descriptors: Tensor, size: int) -> Tensor:
+        return (
+            (descriptors + torch.randint(-size, size + 1, descriptors.shape, generator=generator)).clamp(0, 255).byte()
+        )
+
+    # Of points that look alike the lines decide, and the ratio test refuses some.
+    points.descriptors = noisy(points.descriptors[torch.arange(150) % 40], 40)
+    a, b = (image_keypoints(view, points) for view in ring(points)[:2])
+    b.keypoints.descriptors[:] = noisy(b.keypoints.descriptors, 25)
+    # Of keypoints with equal descriptors near the line, the first is the nearest.
+    a.keypoints.descriptors[5] = a.keypoints.descriptors[4]
+    a.rays[5] = a.rays[4]
+    T = b.T_ref_camera.inverse() @ a.T_ref_camera
+    near = torch.zeros(len(a.keypoints), len(b.keypoints), dtype=torch.bool)
+    for i, ray in enumerate(a.rays):
+        depths = torch.logspace(-3, 5, 20_000, dtype=torch.float64)
+        line = T.apply(ray * depths[:, None])
+        pixels = (line[:, :2] / line[:, 2:])[line[:, 2] > 0]
+        near[i] = torch.cdist(b.rays[:, :2], pixels).amin(1) < EPIPOLAR_BAND / b.focal
+    distance = (a.keypoints.descriptors[:, None].float() - b.keypoints.descriptors.float()).square().sum(-1)
+    banded = torch.where(near, distance, torch.inf)
+    expected = set()
+    for i, row in enumerate(banded):
+        j = int(row.argmin())
+        others = (b.keypoints.pixels - b.keypoints.pixels[j]).norm(dim=-1) >= max(4.0, float(b.keypoints.sizes[j]) / 2)
+        passes = row[j] < 0.85**2 * row[others].min() and row[j] < 0.95**2 * distance[i, others].min()
+        if bool(row[j].isfinite() and banded[:, j].argmin() == i and passes):
+            expected.add((i, j))
+    whole = epipolar_matches(a, b)
+    assert {(i, j) for i, j in whole.pairs.tolist()} == expected
+    assert 10 < len(expected) < len(a.keypoints)
+    monkeypatch.setattr("bidnerf_core.mapping.landmarks.tracks.CACHED", 500)  # blocks of a few rows
+    parts = epipolar_matches(a, b)
+    assert torch.equal(parts.pairs, whole.pairs)
+    assert torch.equal(parts.ambiguity, whole.ambiguity)
 
 
 def test_a_match_that_would_join_two_keypoints_of_an_image_is_left_out() -> None:

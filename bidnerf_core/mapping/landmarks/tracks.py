@@ -16,7 +16,7 @@ from bidnerf_core.depth import UNKNOWN
 from bidnerf_core.frames import SeenLandmarks
 from bidnerf_core.geometry import SE3, mad_deviation
 from bidnerf_core.mapping.geometry.triangulation import Sightings, sum_by, viewing_cones
-from bidnerf_core.mapping.landmarks.descriptors import MANY, byte_of_zero, mutual_nearest, squared_distances
+from bidnerf_core.mapping.landmarks.descriptors import MANY, byte_of_zero, mutual_nearest
 from bidnerf_core.mapping.landmarks.features import ImageKeypoints, Keypoints
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap, Tracks
 
@@ -26,6 +26,8 @@ LEAST_BASELINE = 1e-12
 """Distance (metres) between two cameras below which epipolar lines are undefined."""
 
 
+CACHED = 2**18
+"""Number of distances computed at a time, so that they stay in the processor's cache."""
 ROWS = 1024
 """Number of views whose dissimilarity to all others is computed at a time, to avoid a matrix of all pairs."""
 
@@ -71,21 +73,42 @@ def epipolar_matches(a: ImageKeypoints, b: ImageKeypoints) -> PairMatches:
     A match must also pass the ratio test among all keypoints of ``b``, because a keypoint that resembles many of them
     matches one near the line by chance.
     """
-    if not len(a.keypoints) or not len(b.keypoints):
+    n, m = len(a.keypoints), len(b.keypoints)
+    if not n or not m:
         return PairMatches(torch.zeros((0, 2), dtype=torch.long), torch.zeros(0))
-    distance = squared_distances(a.keypoints.descriptors, b.keypoints.descriptors)
-    banded = distance.masked_fill(~_on_line(a, b), torch.inf)
-    rows, partner = mutual_nearest(banded)
-    best = banded[rows, partner]
-    # Duplicates do not make a match ambiguous: SIFT returns one keypoint for each dominant orientation, and keypoints within the
-    # radius of a keypoint's neighbourhood also have similar descriptors.
-    reach = (b.keypoints.sizes[partner, None] / 2).clamp(min=4.0)  # pixels
-    near = torch.cdist(b.keypoints.pixels[partner], b.keypoints.pixels) < reach
-    next_best = distance[rows].masked_fill(near, torch.inf).amin(dim=1)
-    next_in_band = banded[rows].masked_fill(near, torch.inf).amin(dim=1)
-    good = (best < 0.85**2 * next_in_band) & (best < 0.95**2 * next_best)
-    ambiguity = (best / next_best.clamp(min=1)).sqrt()
-    return PairMatches(torch.stack([rows, partner], dim=-1)[good], ambiguity[good])
+    x, y, lines = a.keypoints.descriptors.float(), b.keypoints.descriptors.float(), EpipolarLines.of(a, b)
+    x_squares, y_squares = x.square().sum(-1, keepdim=True), y.square().sum(-1)
+
+    def distances(rows: Tensor) -> tuple[Float[Tensor, "r m"], Float[Tensor, "r m"]]:
+        """Return the squared distances of some keypoints of ``a`` to those of ``b``, and these near the lines only, else infinity."""
+        distance = torch.addmm(y_squares, x[rows], y.T, alpha=-2).add_(x_squares[rows])
+        return distance, torch.where(lines.near(rows), distance, torch.inf)
+
+    # Blocks of rows stay in the processor's cache.
+    size = max(1, CACHED // m)
+    best, partner = torch.empty(n), torch.empty(n, dtype=torch.long)
+    least = torch.full((m,), torch.inf)
+    for rows in torch.arange(n).split(size):
+        banded = distances(rows)[1]
+        best[rows], partner[rows] = banded.min(1)
+        least = least.minimum(banded.amin(0))
+    mutual = ((best == least[partner]) & best.isfinite()).nonzero()[:, 0]
+    first = torch.full((m,), n).scatter_reduce(
+        0, partner[mutual], mutual, "amin"
+    )  # of keypoints with equal descriptors
+    mutual = mutual[first[partner[mutual]] == mutual]
+    good, ambiguity = torch.zeros(len(mutual), dtype=torch.bool), torch.zeros(len(mutual))
+    for some in torch.arange(len(mutual)).split(size):
+        rows, column = mutual[some], partner[mutual[some]]
+        distance, banded = distances(rows)
+        # Duplicates do not make a match ambiguous: SIFT returns one keypoint for each dominant orientation, and keypoints within the
+        # radius of a keypoint's neighbourhood also have similar descriptors.
+        reach = (b.keypoints.sizes[column, None] / 2).clamp(min=4.0)  # pixels
+        near = torch.cdist(b.keypoints.pixels[column], b.keypoints.pixels) < reach
+        next_best, next_in_band = (each.masked_fill_(near, torch.inf).amin(dim=1) for each in (distance, banded))
+        good[some] = (best[rows] < 0.85**2 * next_in_band) & (best[rows] < 0.95**2 * next_best)
+        ambiguity[some] = (best[rows] / next_best.clamp(min=1)).sqrt()
+    return PairMatches(torch.stack([mutual, partner[mutual]], dim=-1)[good], ambiguity[good])
 
 
 def matches_of_points(
@@ -124,30 +147,48 @@ def matches_of_points(
     ]
 
 
-def _on_line(a: ImageKeypoints, b: ImageKeypoints) -> Bool[Tensor, "n m"]:
-    """Return whether each keypoint of ``b`` lies near the epipolar half-line of each keypoint of ``a``.
+@dataclass(frozen=True, eq=False)
+class EpipolarLines:
+    """The epipolar half-lines, in an image, of the keypoints of another image.
 
-    The half-line starts at the image of the ray's point at infinity. If the camera centres coincide, it reduces to that
-    point.
+    A half-line starts at the image of the ray's point at infinity. If the camera centres coincide, it reduces to that point.
     """
-    T_b_a = b.T_ref_camera.inverse() @ a.T_ref_camera
-    rays, base = T_b_a.rotate(a.rays), T_b_a.translation
-    front = rays[:, 2:].sign()
-    start = rays[:, :2] / rays[:, 2:].abs().clamp(min=1e-9) * front
-    step = (base[:2] - base[2] * start) * front  # direction in which the projection moves as the point comes nearer
-    size = torch.linalg.vector_norm(step, dim=-1, keepdim=True)
-    forward = step / size.clamp(min=1e-300)
-    sideways = torch.stack([-forward[:, 1], forward[:, 0]], dim=-1)
-    seen = torch.cat([b.rays[:, :2], torch.ones_like(b.rays[:, :1])], dim=-1).float().mT
-    band = EPIPOLAR_BAND / b.focal
-    if float(torch.linalg.vector_norm(base)) < LEAST_BASELINE:
-        return torch.cdist(start.float(), seen[:2].mT) <= band
-    across, along = (
-        torch.cat([axis, -(axis * start).sum(-1, keepdim=True)], dim=-1).float() @ seen for axis in (sideways, forward)
-    )
-    # If a ray points behind the other camera, its point at infinity has no projection, so the whole line is allowed.
-    least = torch.where(front > 0, -band, -torch.inf).float()
-    return (across.abs_() <= band) & (along >= least)
+
+    start: Float[Tensor, "n 2"]
+    across: Float[Tensor, "n 3"]  # distance from the line, of a homogeneous point of the image plane at distance 1
+    along: Float[Tensor, "n 3"]  # distance from the start along the line
+    least: Float[Tensor, "n 1"]  # of ``along``
+    band: float
+    seen: Float[Tensor, "3 m"]  # the keypoints of the image
+    coincide: bool
+
+    @staticmethod
+    def of(a: ImageKeypoints, b: ImageKeypoints) -> EpipolarLines:
+        """Return the half-lines of the keypoints of ``a`` in ``b``."""
+        T_b_a = b.T_ref_camera.inverse() @ a.T_ref_camera
+        rays, base = T_b_a.rotate(a.rays), T_b_a.translation
+        front = rays[:, 2:].sign()
+        start = rays[:, :2] / rays[:, 2:].abs().clamp(min=1e-9) * front
+        step = (base[:2] - base[2] * start) * front  # direction in which the projection moves as the point comes nearer
+        size = torch.linalg.vector_norm(step, dim=-1, keepdim=True)
+        forward = step / size.clamp(min=1e-300)
+        sideways = torch.stack([-forward[:, 1], forward[:, 0]], dim=-1)
+        seen = torch.cat([b.rays[:, :2], torch.ones_like(b.rays[:, :1])], dim=-1).float().mT
+        band = EPIPOLAR_BAND / b.focal
+        across, along = (
+            torch.cat([axis, -(axis * start).sum(-1, keepdim=True)], dim=-1).float() for axis in (sideways, forward)
+        )
+        # If a ray points behind the other camera, its point at infinity has no projection, so the whole line is allowed.
+        least = torch.where(front > 0, -band, -torch.inf).float()
+        coincide = float(torch.linalg.vector_norm(base)) < LEAST_BASELINE
+        return EpipolarLines(start.float(), across, along, least, band, seen, coincide)
+
+    def near(self, rows: Int[Tensor, "r"]) -> Bool[Tensor, "r m"]:
+        """Return whether each keypoint of the image lies near the half-lines with the numbers ``rows``."""
+        if self.coincide:
+            return torch.cdist(self.start[rows], self.seen[:2].mT) <= self.band
+        near = (self.across[rows] @ self.seen).abs_() <= self.band
+        return near.logical_and_(self.along[rows] @ self.seen >= self.least[rows])
 
 
 def link_tracks(matches: Sequence[tuple[int, int, PairMatches]], sizes: Sequence[int]) -> Int[Tensor, "m"]:
