@@ -131,6 +131,12 @@ def cells(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Int[Tensor, "m"]:
     return row * CELLS + column
 
 
+MANY_LANDMARKS = 100_000
+"""Number of landmarks above which a query is first matched with those of the images most similar to it."""
+VOTERS, LEAST_VOTES = 150, 5
+"""Number of keypoints that vote for images, and of votes without which no image counts as similar."""
+
+
 @lru_cache(maxsize=1)
 def mirrored_sift() -> Int[Tensor, "128"]:
     """Return the permutation of channels that mirrors a SIFT descriptor: rows (across the orientation) and angles are reversed."""
@@ -146,6 +152,42 @@ AMBIGUITY = 0.9
 """Largest ratio of the descriptor distances of the best and the second-best landmark (Lowe 2004)."""
 OCTAVES, OBLIQUE = 1.0, math.radians(40)
 """Limits of the differences in size (octaves) and in viewing direction (radians) for matches by projection."""
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """The landmarks that each image of a large map shows, by which a query is matched with those of similar images alone."""
+
+    landmark: Int[Tensor, "m"]  # image by image
+    first: Int[Tensor, "v"]  # the first entry of each image in ``landmark``, and the end
+    image: Int[Tensor, "n"]  # the first image that shows each landmark
+    index: InvertedFile
+
+    @staticmethod
+    def of(landmarks: LandmarkMap, index: InvertedFile) -> Places | None:
+        """Sort the tracks of the landmarks; None if the landmarks are few, or their tracks unknown."""
+        tracks = landmarks.tracks
+        if tracks is None or len(landmarks) <= MANY_LANDMARKS:
+            return None
+        order = tracks.image.argsort(stable=True) if bool((tracks.image.diff() < 0).any()) else slice(None)
+        landmark, image = tracks.landmark[order], tracks.image[order]
+        first = torch.full((len(landmarks),), int(image[-1])).scatter_reduce(0, landmark.long(), image.long(), "amin")
+        return Places(landmark, pad(torch.bincount(image).cumsum(0), (1, 0)), first, index)
+
+    def shown(self, descriptors: UInt8[Tensor, "q d"]) -> Int[Tensor, "s"] | None:
+        """Return the landmarks shown by the images that are similar to a query; None without such images, or if these show many.
+
+        Each of some ``descriptors`` votes for the first image that shows the landmark nearest to it. As another place that is as similar
+        must not be missed, an image is similar if it has three tenths of the votes of the best one.
+        """
+        voters = torch.linspace(0, len(descriptors) - 1, min(len(descriptors), VOTERS)).long()
+        votes = torch.bincount(self.image[self.index.nearest(descriptors[voters], 1, cells=4)[1][:, 0]])
+        most = int(votes.max()) if len(votes) else 0
+        if most < LEAST_VOTES:
+            return None
+        similar = (votes >= 0.3 * most).nonzero()[:, 0].tolist()
+        shown = torch.cat([self.landmark[self.first[i] : self.first[i + 1]] for i in similar]).unique().long()
+        return shown if 5 * len(shown) <= MANY_LANDMARKS else None  # comparing more takes longer than searching cells
 
 
 class LandmarkMatcher:
@@ -166,11 +208,13 @@ class LandmarkMatcher:
         self._cached_features: CachedFeatures | None = None  # see ``for_query``
         # None: the search is exhaustive.
         self._index: HalfPrecisionSearch | InvertedFile | None = None
+        self._places: Places | None = None
         if self.device.type != "cpu":
             self._index = HalfPrecisionSearch(landmarks.descriptors)
         elif len(landmarks) > FEW_DESCRIPTORS:
             cells = landmarks.descriptor_cells or DescriptorCells.of(landmarks.descriptors)
             self._index = InvertedFile(landmarks.descriptors, cells)
+            self._places = Places.of(landmarks, self._index)
 
     @property
     def device(self) -> torch.device:
@@ -203,9 +247,13 @@ class LandmarkMatcher:
                 f"the map's descriptors have {channels} channels, those of the image {descriptors.shape[1]}; "
                 "use the detector with which the map was baked, or bake it again"
             )
+        shown = None if self._places is None else self._places.shown(descriptors)
         # Comparing up to four million pairs is faster than searching cells.
         few = len(descriptors) * len(self.landmarks) <= 4_000_000
-        if self._index is None or (few and isinstance(self._index, InvertedFile)):
+        if shown is not None:
+            distance, column = smallest(squared_distances(descriptors, self._descriptors[shown]), count)
+            landmark = shown[column]
+        elif self._index is None or (few and isinstance(self._index, InvertedFile)):
             distance, landmark = smallest(squared_distances(descriptors, self._descriptors), count)
         else:
             distance, landmark = self._index.nearest(descriptors.to(self.device), count)

@@ -21,7 +21,7 @@ from bidnerf_core.localization.matching import (
     QueryKeypoints,
     log10_nfa,
 )
-from bidnerf_core.mapping import LandmarkMap, Sift, States, build_landmarks, squared_distances
+from bidnerf_core.mapping import LandmarkMap, Sift, States, Tracks, build_landmarks, squared_distances
 from conditions import COPY, PINHOLE, point_landmarks, point_view, points, twice
 from landmark_scene import Points, looking_in, ring
 from refusals import refused
@@ -86,6 +86,38 @@ def test_many_landmarks_are_found_by_their_cells() -> None:
     exact = squared_distances(queries, landmarks.descriptors)
     assert torch.equal(exact.gather(1, index), distances)
     assert float((exact.topk(2, largest=False).values == distances).float().mean()) > 0.9
+
+
+def test_queries_of_a_large_map_meet_the_landmarks_of_similar_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two look-alike places are both searched, an unknown one among all landmarks."""
+    monkeypatch.setattr("bidnerf_core.localization.matching.MANY_LANDMARKS", 5000)
+    generator = torch.Generator().manual_seed(0)
+
+    def noisy(descriptors: torch.Tensor) -> torch.Tensor:
+        return (descriptors + torch.randint(-9, 10, descriptors.shape, generator=generator)).clamp(0, 255).byte()
+
+    drawn = torch.randint(0, 256, (8000, 128), generator=generator)
+    seen = drawn[1000:1100].clone()
+    drawn[1000:1100], drawn[7000:7100] = noisy(seen), noisy(seen)  # by images 10 and 70
+    image = torch.arange(8000) // 100
+    order = torch.randperm(8000, generator=generator)  # of an extended map, whose tracks are not in the order of images
+    landmarks = replace(
+        many(8000),
+        descriptors=drawn.byte(),
+        tracks=Tracks(order.int(), image[order].int(), torch.zeros(8000, 2)),
+    )
+    matcher = LandmarkMatcher(landmarks)
+    query = noisy(seen)
+    distance, index = matcher.nearest(query, 4)
+    assert set(image[index].flatten().tolist()) == {10, 70}
+    alike = torch.cat([torch.arange(1000, 1100), torch.arange(7000, 7100)])
+    expected = squared_distances(query, landmarks.descriptors[alike]).topk(4, largest=False)
+    assert torch.equal(distance, expected.values)
+    assert torch.equal(index, alike[expected.indices])
+    unknown = torch.randint(0, 256, (100, 128), generator=generator).byte()
+    monkeypatch.setattr("bidnerf_core.localization.matching.VOTERS", 20)  # chance votes stay below the least
+    everywhere = matcher.nearest(unknown, 4)
+    assert len(image[everywhere[1]].unique()) > 40
 
 
 def test_products_in_half_precision_find_the_nearest_but_for_near_ties() -> None:

@@ -169,9 +169,11 @@ class InvertedFile:
             torch.sum(part.float().square_(), -1, out=squares)
         self._first = pad(torch.bincount(cell, minlength=len(self._centres)).cumsum(0), (1, 0))
 
-    def nearest(self, descriptors: UInt8[Tensor, "q d"], count: int) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
-        """Return the squared distances and the indices of the nearest landmarks in the twelve cells nearest to each descriptor."""
-        probed = smallest(squared_distances(descriptors, self._centres), 12)[1]
+    def nearest(
+        self, descriptors: UInt8[Tensor, "q d"], count: int, cells: int = 12
+    ) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
+        """Return the squared distances and the indices of the nearest landmarks in the ``cells`` nearest to each descriptor."""
+        probed = smallest(squared_distances(descriptors, self._centres), cells)[1]
         counts = torch.diff(self._first)[probed]
         ends = counts.cumsum(1)
         width = int(ends[:, -1].max()) if len(ends) else 0
