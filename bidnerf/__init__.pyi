@@ -1,4 +1,5 @@
 from bidnerf.evaluation import Plan as Plan
+from bidnerf.evaluation import cluster as cluster
 from bidnerf.evaluation import compare as compare
 from bidnerf.evaluation import evaluate as evaluate
 from bidnerf.results import Answers as Answers

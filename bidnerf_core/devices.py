@@ -1,14 +1,14 @@
-"""Torch devices and threads: placement of tensors, waiting for a device, CUDA graphs, and the number of CPU threads."""
+"""Torch devices and threads: placement of tensors, waiting for a device, CUDA graphs, the number of CPU threads, and tasks on many."""
 
 from __future__ import annotations
 
 import copy
 import warnings
 import weakref
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections import OrderedDict, deque
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
@@ -21,6 +21,7 @@ from torch import Generator, Tensor, nn
 from torch.utils._pytree import tree_leaves
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.progress import current_job
 
 T = TypeVar("T")
 _Rows = TypeVar("_Rows", bound="TensorRows")
@@ -392,3 +393,28 @@ def set_threads_here(count: int) -> None:
 def _in_new_thread(function: Callable[[], T]) -> T:
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(function).result()
+
+
+AHEAD = 64
+"""Number of tasks submitted ahead of the results, which bounds the memory of what runs them."""
+
+
+def map_tasks(work: Callable[..., T], tasks: Iterable[tuple[Any, ...]]) -> Iterator[T]:
+    """Yield ``work(*task)`` for each of the independent tasks, in order.
+
+    The executor of this thread's job runs them (see ``job_context``), otherwise as many threads as torch uses. Other processes receive
+    ``work`` and the tasks by pickle.
+    """
+    executor = current_job().executor
+    with ThreadPoolExecutor(max(1, torch.get_num_threads())) if executor is None else nullcontext(executor) as pool:
+        waiting = deque[Future[T]]()
+        try:
+            for task in tasks:
+                waiting.append(pool.submit(work, *task))
+                if len(waiting) > AHEAD:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()

@@ -1,9 +1,10 @@
-"""Progress reports, remarks and cancellation of long-running work."""
+"""Progress reports, remarks and cancellation of long-running work, and what runs its tasks."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -39,22 +40,25 @@ Cancel: TypeAlias = Callable[[], bool]
 
 @dataclass(frozen=True)
 class Job:
-    """The callbacks of the current work: one receives its progress, the other may cancel it."""
+    """The callbacks of the current work (one receives its progress, the other may cancel it), and what runs its tasks."""
 
     progress: ProgressCallback | None = None
     cancel: Cancel | None = None
+    executor: Executor | None = None  # None: threads of this process
 
 
 _JOB: ContextVar[Job] = ContextVar("job", default=Job())  # noqa: B039 (it is frozen)
 
 
 @contextmanager
-def job_context(progress: ProgressCallback | None = None, cancel: Cancel | None = None) -> Iterator[None]:
-    """Set the callbacks that receive the progress of this thread's work, or cancel it, within the block.
+def job_context(
+    progress: ProgressCallback | None = None, cancel: Cancel | None = None, executor: Executor | None = None
+) -> Iterator[None]:
+    """Set the callbacks that receive the progress of this thread's work, or cancel it, and the executor of its tasks, within the block.
 
     Functions that take ``progress`` and ``cancel`` from users open this block once; the functions that they call report with
-    ``counter`` and stop in ``check_cancelled``. A callback that is None is inherited from the enclosing block. Raises ``InputError``
-    if a callback is not callable (for example, if ``cancel`` is an event rather than its ``is_set``).
+    ``counter`` and stop in ``check_cancelled``. What is None is inherited from the enclosing block. The executor, such as that of a
+    cluster, runs independent tasks (see ``devices.map_tasks``) in other processes, with the same results. Raises ``InputError`` if a callback is not callable (for example, if ``cancel`` is an event rather than its ``is_set``).
     """
     for name, given, expected in (
         ("cancel", cancel, "a function, such as the is_set of an event"),
@@ -63,7 +67,7 @@ def job_context(progress: ProgressCallback | None = None, cancel: Cancel | None 
         if given is not None and not callable(given):
             raise InputError(f"{name} is a {type(given).__name__}", expected=expected)
     outer = _JOB.get()
-    token = _JOB.set(Job(progress or outer.progress, cancel or outer.cancel))
+    token = _JOB.set(Job(progress or outer.progress, cancel or outer.cancel, executor or outer.executor))
     try:
         yield
     finally:

@@ -30,6 +30,7 @@ from .results import provenance as provenance
 from .results import read_results as read_results
 from .results import read_runs as read_runs
 from .results import script_command as script_command
+from .run import cluster as cluster
 from .run import evaluate as evaluate
 from .run import local_processes as local_processes
 from .run import missing_trials as missing_trials

@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
@@ -280,13 +281,24 @@ def executor_of(workers: Workers, trials: int, on_cpu: bool) -> Iterator[tuple[E
             threads = sum(client.nthreads().values())
             if threads == 0:
                 raise InputError(f"the dask scheduler at {workers} has no workers", expected="at least one")
-            yield client.get_executor(), 2 * threads, f"dask, {threads} threads"
+            yield client.get_executor(pure=False), 2 * threads, f"dask, {threads} threads"
         return
     if workers is not None and workers < 1:
         raise InputError(f"workers is {workers}", expected="1 or more, or None for one per core")
     count = min(workers or (usable_cores() if on_cpu else 1), trials)
     with terminate_on_failure(InThisProcess() if count == 1 else local_processes(count)) as executor:
         yield executor, count, f"{count} local process{'es' if count > 1 else ''} of one thread"
+
+
+@contextmanager
+def cluster(workers: Workers) -> Iterator[None]:
+    """Let ``train`` and ``find_poses`` detect and match keypoints in other processes within the block; the results are the same.
+
+    ``workers`` is a number of local processes (None: one per core), or the address of a dask scheduler, which repeats the tasks of a
+    worker that is lost. Raises ``InputError`` as ``evaluate`` does.
+    """
+    with executor_of(workers, sys.maxsize, True) as (executor, *_), job_context(executor=executor):
+        yield
 
 
 @contextmanager

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from math import ceil, radians
@@ -14,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bidnerf_core.camera import MotionPrior
+from bidnerf_core.devices import map_tasks
 from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.frames import SeenLandmarks, View
 from bidnerf_core.geometry import SE3, chi_squared_quantile, inlier_weight
@@ -56,7 +56,6 @@ LEAST_VISIBLE_POINTS = 20
 """Minimum number of points from which the pose of an image is estimated."""
 ENOUGH_IMAGES = 8
 """Minimum number of images from which the covariance of pose updates is estimated."""
-_Item = TypeVar("_Item")
 Result = TypeVar("Result")
 
 
@@ -241,7 +240,7 @@ def track_views(
         raise InputError("nothing to build landmarks from:", expected="at least one view")
     pairs = likely_pairs([view.T_ref_camera for view in views if labels is None], config.neighbours)
     step = _counter("landmarks", "images and pairs", len(views) + len(pairs))
-    images = _map_in_threads(lambda view: image_keypoints(view, detector), views, step)
+    images = _counted(map_tasks(image_keypoints, ((view, detector) for view in views)), step)
     lengths = sorted({image.keypoints.descriptors.shape[1] for image in images})
     if len(lengths) > 1:
         raise PluginError(
@@ -263,7 +262,7 @@ def _link_keypoints(
 ) -> TrackedKeypoints:
     """Match the keypoints of the pairs of images, and join the matches into tracks, starting with ``known`` ones of ambiguity 0."""
     listed = pairs.tolist()
-    matches = _map_in_threads(lambda ij: epipolar_matches(images[ij[0]], images[ij[1]]), listed, step)
+    matches = _counted(map_tasks(epipolar_matches, ((images[i], images[j]) for i, j in listed)), step)
     matched = [(i, j, m) for (i, j), m in zip(listed, matches, strict=True)]
     label = link_tracks([*known, *matched], [len(image.keypoints) for image in images])
     return TrackedKeypoints(images, label, torch.arange(len(label)))
@@ -271,7 +270,7 @@ def _link_keypoints(
 
 def detect_keypoints(views: Sequence[View], features: Features) -> list[ImageKeypoints]:
     """Detect the keypoints of ``views`` without matching them."""
-    return _map_in_threads(lambda view: image_keypoints(view, features), views)
+    return [*map_tasks(image_keypoints, ((view, features) for view in views))]
 
 
 def _build(observations: TrackedKeypoints, config: LandmarkConfig, known: Float[Tensor, "p 3"] | None) -> LandmarkMap:
@@ -329,16 +328,13 @@ def _triangulate(
     return observations, points[numbers], covariance[numbers]
 
 
-def _map_in_threads(
-    work: Callable[[_Item], Result], items: Sequence[_Item], step: Callable[[], None] = lambda: None
-) -> list[Result]:
-    """Apply ``work`` to each item, with as many threads as torch uses, and call ``step`` after each."""
-    results = []
-    with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
-        for result in pool.map(work, items):
-            step()
-            results.append(result)
-    return results
+def _counted(results: Iterable[Result], step: Callable[[], None]) -> list[Result]:
+    """Return the results, and call ``step`` after each."""
+    counted = []
+    for result in results:
+        step()
+        counted.append(result)
+    return counted
 
 
 def _counter(stage: str, unit: str, total: int) -> Callable[[], None]:
