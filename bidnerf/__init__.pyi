@@ -24,11 +24,11 @@ from bidnerf_core.frames import View as View
 from bidnerf_core.geometry import SE3 as SE3
 from bidnerf_core.localization import Localization as Localization
 from bidnerf_core.localization import Outcome as Outcome
-from bidnerf_core.localization import Tracker as Tracker
 from bidnerf_core.maps import ImportOptions as ImportOptions
 from bidnerf_core.maps import Localizer as Localizer
 from bidnerf_core.maps import Map as Map
 from bidnerf_core.maps import MapCollection as MapCollection
+from bidnerf_core.maps import Tracker as Tracker
 from bidnerf_core.maps import TrainOptions as TrainOptions
 from bidnerf_core.maps import extend as extend
 from bidnerf_core.maps import import_map as import_map

@@ -47,8 +47,8 @@ def run_demo(
     from bidnerf_core.datasets import DatasetOptions, write_transforms
     from bidnerf_core.geometry import perturb, symbol
     from bidnerf_core.io import output_folder
-    from bidnerf_core.localization import Localizer, settings_of
-    from bidnerf_core.maps import TrainOptions, train
+    from bidnerf_core.localization import settings_of
+    from bidnerf_core.maps import Localizer, TrainOptions, train
     from bidnerf_core.settings import from_flat
 
     config = quick_config(load_backend(backend))

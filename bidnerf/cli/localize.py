@@ -35,8 +35,7 @@ if TYPE_CHECKING:
     from bidnerf.results import Answer, Answers, Failure
     from bidnerf_core.datasets import Query
     from bidnerf_core.geometry import SE3
-    from bidnerf_core.localization import Localizer
-    from bidnerf_core.maps import MapCollection
+    from bidnerf_core.maps import Localizer, MapCollection
 
 
 @dataclass(frozen=True)
@@ -130,13 +129,8 @@ def run_localize(
     OpenCV axes (x right, y down, z forward).
     """
     from bidnerf.results import Answers, localize, pose_format
-    from bidnerf_core.localization import (
-        Localizer,
-        landmark_cameras,
-        matches_landmarks,
-        require_fit,
-    )
-    from bidnerf_core.maps import MapCollection, load_map, maps_in
+    from bidnerf_core.localization import landmark_cameras, matches_landmarks, require_fit
+    from bidnerf_core.maps import Localizer, MapCollection, load_map, maps_in
 
     count = next((n for n, path in enumerate(query) if not _holds_maps(path)), len(query))
     maps, paths = [map, *query[:count]], query[count:]

@@ -87,8 +87,8 @@ def run_track(
     """
     from bidnerf.results import Answers, check_pose_file, read_pose, require_matplotlib, track
     from bidnerf_core.datasets import is_video
-    from bidnerf_core.localization import Localizer, Tracker, settings_of
-    from bidnerf_core.maps import load_map
+    from bidnerf_core.localization import settings_of
+    from bidnerf_core.maps import Localizer, Tracker, load_map
 
     check_pose_file(out)
     if plot is not None:

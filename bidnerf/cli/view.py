@@ -92,8 +92,7 @@ def run_view(
     from bidnerf.viewer import MapView, answer_all, map_json, row_json, trajectory_json
     from bidnerf_core.camera import CameraSource
     from bidnerf_core.datasets import DatasetFrames
-    from bidnerf_core.localization import Localizer
-    from bidnerf_core.maps import load_info, load_map
+    from bidnerf_core.maps import Localizer, load_info, load_map
 
     require_device(server.device)
     info = load_info(map)

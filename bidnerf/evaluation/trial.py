@@ -33,8 +33,7 @@ from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import from_plain, to_plain
-from bidnerf_core.localization import Localizer
-from bidnerf_core.maps import DESCRIPTION, Map, ViewSource, load_map
+from bidnerf_core.maps import DESCRIPTION, Localizer, Map, ViewSource, load_map
 from bidnerf_core.registry import registered, require_registered
 from bidnerf_core.settings import to_flat
 

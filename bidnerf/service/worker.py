@@ -29,8 +29,8 @@ from bidnerf.service.upload import public_message, read_upload
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.io import parse_json, to_plain
-from bidnerf_core.localization import Localizer, settings_of
-from bidnerf_core.maps import Map, MapCollection, load_map
+from bidnerf_core.localization import settings_of
+from bidnerf_core.maps import Localizer, Map, MapCollection, load_map
 
 
 class LoadedMaps:

@@ -35,12 +35,13 @@ from bidnerf.testing.textured_field import (
 )
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import METHODS, Localization, Localizer
+from bidnerf_core.localization import METHODS, Localization
 from bidnerf_core.mapping import (
     Keypoints,
     find_features,
     squared_distances,
 )
+from bidnerf_core.maps import Localizer
 from bidnerf_core.registry import interface_defects
 
 # Methods.

@@ -46,7 +46,8 @@ from bidnerf_core.datasets import Query, QuerySource
 from bidnerf_core.errors import Cancelled, InputError
 from bidnerf_core.geometry import SE3, pose_from_matrix
 from bidnerf_core.io import parse_json, to_plain
-from bidnerf_core.localization import Localizer, SearchRecord
+from bidnerf_core.localization import SearchRecord
+from bidnerf_core.maps import Localizer
 
 log = logging.getLogger("bidnerf.viewer")
 

@@ -25,8 +25,8 @@ from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import to_plain, write_file
-from bidnerf_core.localization import Localization, Localizer, SearchRecord, record_search
-from bidnerf_core.maps import Map
+from bidnerf_core.localization import Localization, SearchRecord, record_search
+from bidnerf_core.maps import Localizer, Map
 from bidnerf_core.progress import counter
 
 log = logging.getLogger("bidnerf")

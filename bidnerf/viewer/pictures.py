@@ -19,7 +19,8 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import has_field, render_image
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import png_bytes
-from bidnerf_core.localization import SceneMap, picture_at, surface_renderer
+from bidnerf_core.localization import SceneMap, surface_renderer
+from bidnerf_core.maps import picture_at
 
 JsonObject: TypeAlias = dict[str, Any]
 """A part of the page's state, which the page's scripts read. Its entries are described by the function that returns it."""

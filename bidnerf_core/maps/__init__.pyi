@@ -20,7 +20,11 @@ from .importing import import_map as import_map
 from .known_lengths import ScaleFit as ScaleFit
 from .known_lengths import factor_of_distance as factor_of_distance
 from .known_lengths import factor_of_poses as factor_of_poses
-from .map import Localizer as Localizer
+from .localizer import Localizer as Localizer
+from .localizer import Start as Start
+from .localizer import picture_at as picture_at
+from .localizer import scene_of as scene_of
+from .localizer import start_pose as start_pose
 from .map import Map as Map
 from .map import load_map as load_map
 from .store import Checkpoints as Checkpoints
@@ -31,6 +35,7 @@ from .store import write_parts as write_parts
 from .summary import MapSummary as MapSummary
 from .summary import RenderingScores as RenderingScores
 from .summary import rendering_scores as rendering_scores
+from .tracker import Tracker as Tracker
 from .training import MapOptions as MapOptions
 from .training import OtherSettings as OtherSettings
 from .training import TrainOptions as TrainOptions

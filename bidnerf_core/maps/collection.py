@@ -21,7 +21,6 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import (
     USUAL_METHOD,
     Localization,
-    Localizer,
     Outcome,
     localize_by_landmarks,
     origin_of,
@@ -29,6 +28,7 @@ from bidnerf_core.localization import (
 )
 from bidnerf_core.mapping import LandmarkMap, Vocabulary, detect, find_features, pool_views
 from bidnerf_core.maps.description import DESCRIPTION, cameras_of, load_info
+from bidnerf_core.maps.localizer import Localizer
 from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.maps.store import read_part
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context, log

@@ -41,8 +41,7 @@ from bidnerf_core.fields import (
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import lock
-from bidnerf_core.localization import Localizer as Localizer  # with maps to load, as bidnerf offers it
-from bidnerf_core.localization import move_map_to, origin_of, scene_of
+from bidnerf_core.localization import move_map_to, origin_of
 from bidnerf_core.mapping import (
     BakeConfig,
     HeldOutTrial,
@@ -465,6 +464,3 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
     if info.interruption is not None:
         log.info(f"{folder}: {info.interruption}")
     return Map(info, build_frozen_field(info, weights, folder), surface, landmarks, folder).to(device)
-
-
-scene_of.register(str | Path, lambda folder, where: load_map(folder))  # a Localizer opens a folder

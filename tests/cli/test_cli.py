@@ -32,9 +32,8 @@ from bidnerf.service import LocalizationBody
 from bidnerf_core.backend import load_backend
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import Localizer
 from bidnerf_core.mapping import BakeConfig
-from bidnerf_core.maps import Checkpoints, MapInfo, load_info, load_map
+from bidnerf_core.maps import Checkpoints, Localizer, MapInfo, load_info, load_map
 from bidnerf_core.training import TrainingStep
 from commands import Run, assert_refused, quietly, strict
 from trainings import assert_same_map, stop_at
@@ -610,5 +609,5 @@ def test_localizing_imports_nothing_that_only_other_work_needs() -> None:
     others = "imageio scipy.optimize matplotlib viser pycolmap av jinja2 uvicorn torch._dynamo"
     program = "import sys, bidnerf as bn, bidnerf.cli.localize; bn.Localizer, bn.load_map; print(*sys.modules)"
     imported = {*quietly([sys.executable, "-c", program]).split()}
-    assert "bidnerf_core.localization.localizer" in imported
+    assert "bidnerf_core.maps.localizer" in imported
     assert not {*others.split()} & imported

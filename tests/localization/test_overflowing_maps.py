@@ -10,8 +10,8 @@ from torch import Tensor
 
 from bidnerf.testing import textured_map
 from bidnerf_core.errors import InputError
-from bidnerf_core.localization import Localizer, Tracker
 from bidnerf_core.mapping import surface_from_tensors, surface_tensors
+from bidnerf_core.maps import Localizer, Tracker
 from flights import flight
 from optional import require
 

@@ -28,7 +28,7 @@ from bidnerf_core.backend import BACKENDS
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import look_at
-from bidnerf_core.localization import Localizer
+from bidnerf_core.maps import Localizer
 from bidnerf_core.maps import train
 
 CAMERA = Intrinsics(130.0, 130.0, 64.0, 48.0, 128, 96)

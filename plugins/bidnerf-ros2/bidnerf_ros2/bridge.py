@@ -12,8 +12,8 @@ import torch
 from bidnerf.results import standard_deviations
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3, covariance_in
-from bidnerf_core.localization import Localization, Tracker
-from bidnerf_core.maps import Localizer
+from bidnerf_core.localization import Localization
+from bidnerf_core.maps import Localizer, Tracker
 from bidnerf_ros2.conversions import covariance_elsewhere, fill, seconds
 from bidnerf_ros2.corrector import Corrector
 from bidnerf_ros2.messages import frame_of, intrinsics

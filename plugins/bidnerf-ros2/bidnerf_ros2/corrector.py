@@ -8,7 +8,8 @@ from threading import Lock
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import Localization, Localizer
+from bidnerf_core.localization import Localization
+from bidnerf_core.maps import Localizer
 
 
 class Corrector:

@@ -29,18 +29,24 @@ from bidnerf_core.fields import Observations, device_of, has_field, render, rend
 from bidnerf_core.frames import Frame, View, photos_in
 from bidnerf_core.geometry import SE3, pose_from_matrix
 from bidnerf_core.io import LARGEST_INTEGER, png_bytes
-from bidnerf_core.localization.matching import LandmarkMatcher
-from bidnerf_core.localization.methods import USUAL_METHOD, find_method, require_fit, settings_of
-from bidnerf_core.localization.problem import (
+from bidnerf_core.localization import (
+    USUAL_METHOD,
+    LandmarkMatcher,
+    Localization,
+    Outcome,
     Problem,
     SceneMap,
+    Verdict,
+    find_method,
     landmark_cameras,
     move_map_to,
     origin_of,
+    require_fit,
     rig,
+    settings_of,
     unit_of,
 )
-from bidnerf_core.localization.result import Localization, Outcome, Verdict
+from bidnerf_core.maps.map import load_map
 from bidnerf_core.progress import counter, current_job, job_context
 
 NO_DISTANCES = "the map's photos are from one place and show no distances"
@@ -245,12 +251,10 @@ class Localizer:
             self.scene.surface.warm_up()
 
 
-@functools.singledispatch
 def scene_of(given: object, where: str) -> SceneMap:
-    """Return the map ``given``, or the map that ``given`` refers to, such as the folder that stores it.
-
-    ``bidnerf_core.maps`` registers how paths are opened. Raises ``InputError``, prefixed with ``where``, for anything else.
-    """
+    """Return the map ``given``, or the map in the folder ``given``. Raises ``InputError``, prefixed with ``where``, for anything else."""
+    if isinstance(given, str | Path):
+        return load_map(given)
     if isinstance(given, SceneMap):
         return given
     raise InputError(f"got a {type(given).__name__}", where=where, expected="a Map, or the folder of one")

@@ -13,23 +13,36 @@ import torch
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.auto import localize_by_landmarks, within_limits
-from bidnerf_core.localization.by_surface import is_blank
-from bidnerf_core.localization.localizer import NO_DISTANCES, Localizer, Start, start_pose
-from bidnerf_core.localization.problem import SceneMap, extent_of, origin_of, start_covariance, unit_of
-from bidnerf_core.localization.propose import search_radius
-from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.settings import TrackerConfig
-from bidnerf_core.localization.tracking.measuring import Measurement, Measurer, shows_shape
-from bidnerf_core.localization.tracking.motion import Clock, Motion, PoseEstimate
-from bidnerf_core.localization.tracking.points import POINTS, Grey, Points
-from bidnerf_core.localization.tracking.state import (
+from bidnerf_core.localization import (
+    POINTS,
+    Clock,
+    Grey,
+    Localization,
+    Measurement,
+    Measurer,
+    Motion,
+    Outcome,
+    Points,
+    PoseEstimate,
+    SceneMap,
+    TrackerConfig,
     TrackerState,
+    Verdict,
+    extent_of,
     invert_correction,
+    is_blank,
     load_tracker_state,
+    localize_by_landmarks,
+    origin_of,
     save_state,
+    search_radius,
+    shows_shape,
+    start_covariance,
+    unit_of,
+    within_limits,
 )
 from bidnerf_core.mapping import grey_image, limit_features
+from bidnerf_core.maps.localizer import NO_DISTANCES, Localizer, Start, start_pose
 
 
 class Tracker:
