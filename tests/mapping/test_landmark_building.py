@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from bidnerf import SE3, Frame, InputError, Intrinsics, View
+from bidnerf_core.geometry import look_at
 from bidnerf_core.mapping import (
     LandmarkConfig,
     LandmarkMap,
@@ -246,6 +247,23 @@ def test_likely_pairs_are_neighbours_on_the_ring() -> None:
     assert int(apart.max()) <= 5
     assert int((apart == 1).sum()) == 24
     assert likely_pairs(poses[:2], 8).tolist() == [[0, 1]]
+
+
+@pytest.mark.parametrize("rooms", [1, 8, 200])
+def test_pairs_show_the_same_walls_in_a_building_as_in_a_room(rooms: int) -> None:
+    """Photos are taken all over rooms of 4 x 3 m, 20 in each, in all directions."""
+    generator = torch.Generator().manual_seed(0)
+    room = torch.arange(rooms).repeat_interleave(20)
+    corner = torch.stack([room % 10 * 4.3, room // 10 % 10 * 3.3, room // 100 * 3.0], dim=-1)
+    centre = corner + torch.rand(len(room), 3, generator=generator) * torch.tensor([3.0, 2.0, 0.6])
+    angle = 2 * math.pi * torch.rand(len(room), generator=generator)
+    ahead = centre + torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], dim=-1)
+    poses = [look_at(tuple(eye), tuple(target)) for eye, target in zip(centre.tolist(), ahead.tolist(), strict=True)]
+    first, second = likely_pairs(poses, 8).unbind(-1)
+    alike = (room[first] == room[second]) & ((angle[first] - angle[second]).cos() > 0.5)
+    assert 0.4 < float(alike.double().mean()) < 0.6
+    # Of some places, many photos may be taken from one point.
+    assert len(likely_pairs(poses[:1] * 300, 8)) > 300
 
 
 def test_robust_covariance_is_right_for_normal_values_and_holds_with_outliers(

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bidnerf_core.camera import poses_of_rows
@@ -28,18 +29,19 @@ LEAST_BASELINE = 1e-12
 
 CACHED = 2**18
 """Number of distances computed at a time, so that they stay in the processor's cache."""
-ROWS = 1024
-"""Number of views whose dissimilarity to all others is computed at a time, to avoid a matrix of all pairs."""
+NEARBY = 128
+"""Number of nearest cameras among which an image is matched. On a drawn building of 320 rooms of 20 photos, half of the pairs show the
+same walls, as in a single room; among the nearest 500, or among all, fewer do."""
 
 
 def likely_pairs(poses: Sequence[SE3], neighbours: int) -> Int[Tensor, "p 2"]:
     """Return pairs (i < j) of cameras with similar ``poses`` (T_world_camera), without duplicates.
 
-    The dissimilarity is the distance between the centres relative to the mean over all pairs, plus 1 - cosine between the optical axes.
-    Half of a camera's ``neighbours`` are those with the most similar poses. The other half are every third one of the cameras that follow
-    in this order, because successive images of a video have too little baseline for triangulation.
+    Of the cameras nearest to each, the dissimilarity is the distance between the centres relative to the mean over all such pairs, plus
+    1 - cosine between the optical axes. Half of a camera's ``neighbours`` are those with the most similar poses. The other half are every
+    third one of the cameras that follow in this order, because successive images of a video have too little baseline for triangulation.
     """
-    others = len(poses) - 1
+    others = min(len(poses) - 1, NEARBY)
     if others < 1:
         return torch.zeros((0, 2), dtype=torch.long)
     near = (neighbours + 1) // 2
@@ -47,16 +49,15 @@ def likely_pairs(poses: Sequence[SE3], neighbours: int) -> Int[Tensor, "p 2"]:
     ranks = [rank for rank in wanted if rank < others] or list(range(others))
     centres = torch.stack([pose.translation.cpu().double() for pose in poses])
     axes = torch.stack([pose.rotation[:, 2].cpu().double() for pose in poses])
-    blocks = torch.arange(len(poses)).split(ROWS)
-    usual = sum(float(torch.cdist(centres[own], centres).sum()) for own in blocks) / len(poses) ** 2
-    pairs = []
-    for own in blocks:
-        unlike = torch.cdist(centres[own], centres) / max(usual, 1e-12) + 1 - axes[own] @ axes.T
-        unlike[torch.arange(len(own)), own] = torch.inf
-        chosen = unlike.argsort(dim=1, stable=True)[:, ranks]
-        ends = own[:, None].expand_as(chosen)
-        pairs.append(torch.stack([ends.minimum(chosen), ends.maximum(chosen)], dim=-1).reshape(-1, 2))
-    return torch.cat(pairs).unique(dim=0)
+    away, number = map(torch.from_numpy, cKDTree(centres.numpy()).query(centres.numpy(), others + 1))
+    # The camera itself is not always the first: several may be at one place.
+    own = number == torch.arange(len(poses))[:, None]
+    own[~own.any(1), -1] = True
+    number, away = (each[~own].view(-1, others) for each in (number, away))
+    unlike = away / max(float(away.mean()), 1e-12) + 1 - (axes[number] @ axes[..., None])[..., 0]
+    chosen = number.gather(1, unlike.argsort(dim=1, stable=True)[:, ranks])
+    ends = torch.arange(len(poses))[:, None].expand_as(chosen)
+    return torch.stack([ends.minimum(chosen), ends.maximum(chosen)], dim=-1).view(-1, 2).unique(dim=0)
 
 
 @dataclass(frozen=True, eq=False)
