@@ -19,6 +19,8 @@ from .contract import device_of as device_of
 from .contract import intersect_box as intersect_box
 from .contract import levels as levels
 from .contract import widen as widen
+from .differentiation import channels as channels
+from .differentiation import differentiate as differentiate
 from .encoding import encoding_width as encoding_width
 from .encoding import frequency_encoding as frequency_encoding
 from .encoding import octaves as octaves

@@ -25,6 +25,11 @@ from .pixels import inpaint as inpaint
 from .pixels import observe as observe
 from .pixels import uniform as uniform
 from .pixels import visible_at as visible_at
+from .small_images import Thumbnail as Thumbnail
+from .small_images import averaged as averaged
+from .small_images import is_blank as is_blank
+from .small_images import slopes as slopes
+from .small_images import smooth as smooth
 from .storage import ImagePixels as ImagePixels
 from .storage import PixelStore as PixelStore
 from .storage import bytes_of as bytes_of

@@ -13,7 +13,6 @@ from .accept import same_pose as same_pose
 from .accept import support as support
 from .auto import localize_by_landmarks as localize_by_landmarks
 from .auto import within_limits as within_limits
-from .by_surface import is_blank as is_blank
 from .explanations import CAMERAS as CAMERAS
 from .loop import HEAVY_TAILS as HEAVY_TAILS
 from .loop import LandmarkAnswer as LandmarkAnswer

@@ -14,7 +14,7 @@ from torch.nn.functional import normalize
 
 from bidnerf_core.devices import move_to
 from bidnerf_core.fields import levels
-from bidnerf_core.frames import Frame
+from bidnerf_core.frames import Thumbnail, is_blank
 from bidnerf_core.geometry import SE3, random_units
 from bidnerf_core.localization.accept import Support, support
 from bidnerf_core.localization.problem import Problem
@@ -31,7 +31,7 @@ from bidnerf_core.localization.search import (
     states_at,
 )
 from bidnerf_core.localization.settings import AutoConfig, ColourSettings, DepthLossSettings
-from bidnerf_core.localization.terms.images import ColourScales, Images, Thumbnail, surface_renderer
+from bidnerf_core.localization.terms.images import Images, surface_renderer
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.mapping import GaussianPrior, States, SurfaceMap, cast, descend, trace
 
@@ -165,7 +165,7 @@ def by_images(
     for width, steps, keep in IMAGE_STAGES:
         thumbnails = [move_to(Thumbnail.of(view, width), surface.device) for view in problem.views]
         # Wide scales cope with images exposed twice or half as long as the map's.
-        stages.append(Stage([Images(renderer, thumbnails, ColourScales(gain=1.0, rounds=5))], steps, keep))
+        stages.append(Stage([Images(renderer, thumbnails, gain=1.0, rounds=5)], steps, keep))
     start = states_at(hypotheses(surface, problem.start, middle, count, False, seed))
     return halve(start, [*stages, *later], middle, surface.device), middle
 
@@ -247,13 +247,3 @@ def covariance_by_depth(
     shared = torch.stack([problem.sensor.scale * middle, problem.sensor.offset * sight], -1)
     found[:3, :3] += shared @ shared.mT
     return (found + found.mT) / 2, precision
-
-
-def is_blank(frame: Frame) -> bool:
-    """Return whether the image has a single colour, as if the lens were covered, or the frame has no colours at all."""
-    # Of an image of many megapixels, some 100,000 pixels suffice.
-    step = 1 + math.isqrt(frame.intrinsics.width * frame.intrinsics.height // 100_000)
-    rgb = frame.rgb_bytes[::step, ::step].float() / 255
-    shown = rgb.flatten(0, 1) if frame.hidden is None else rgb[~frame.hidden[::step, ::step]]
-    # A gain and an offset can fit any view to an image whose colours, in [0, 1], deviate by less.
-    return not frame.has_colour or float(shown.std(0, correction=0).max()) < 0.02

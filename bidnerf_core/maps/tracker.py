@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.frames import Frame
+from bidnerf_core.frames import Frame, is_blank
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import (
     POINTS,
@@ -30,7 +30,6 @@ from bidnerf_core.localization import (
     Verdict,
     extent_of,
     invert_correction,
-    is_blank,
     load_tracker_state,
     localize_by_landmarks,
     origin_of,

@@ -19,10 +19,7 @@ from bidnerf_bid import DRAWERS, DrawerName
 from bidnerf_core.camera import Orientation, Raster
 from bidnerf_core.carving import FreeSpace
 from bidnerf_core.fields import RenderedImage
-from bidnerf_core.frames import MaskFolder, WhollyHidden, masks_sentence, read_mask
-from bidnerf_core.localization.by_surface import is_blank
-from bidnerf_core.localization.terms.images import Thumbnail
-from bidnerf_core.localization.terms.rays import averaged
+from bidnerf_core.frames import MaskFolder, Thumbnail, WhollyHidden, averaged, is_blank, masks_sentence, read_mask
 from bidnerf_core.mapping import SIFT, image_keypoints, track_views
 from bidnerf_core.maps import rendering_scores
 

@@ -14,9 +14,9 @@ from bidnerf.evaluation import faulty
 from bidnerf.results import pose_error
 from bidnerf_bid import DRAWERS
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.frames import Frame, View, is_blank
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import AutoConfig, Localization, Outcome, is_blank
+from bidnerf_core.localization import AutoConfig, Localization, Outcome
 from optional import require
 from problems import localize
 from refusals import refused

@@ -15,10 +15,10 @@ import baked
 import module_fields
 from bidnerf_core.devices import move_to, without_waiting
 from bidnerf_core.fields import RadianceField
-from bidnerf_core.frames import View
+from bidnerf_core.frames import Thumbnail, View
 from bidnerf_core.geometry import SE3, perturb
 from bidnerf_core.localization import ColourSettings, DepthLossSettings, Images, draw_rays, rig, states_at
-from bidnerf_core.localization.terms.images import Thumbnail, surface_renderer
+from bidnerf_core.localization.terms.images import surface_renderer
 from bidnerf_core.mapping import CostTerm, SurfaceMap, cast, descend, trace
 from problems import FieldMap
 from simulated_device import DEVICE, Elsewhere

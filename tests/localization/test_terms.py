@@ -21,10 +21,11 @@ from bidnerf_core.fields import (
     RaySampler,
     SceneBounds,
     Stratified,
+    differentiate,
     render,
     render_image,
 )
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.frames import Frame, Thumbnail, View, averaged, smooth
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import (
     ColourSettings,
@@ -37,18 +38,12 @@ from bidnerf_core.localization import (
     states_at,
 )
 
-# Inside: derivatives of single rays, exposures and thumbnails, of which a descent sees only sums
-from bidnerf_core.localization.terms import rendering
+# Inside: exposures and renderers of images, of which a descent sees only sums
 from bidnerf_core.localization.terms.exposure import eliminate, fit_exposure
 from bidnerf_core.localization.terms.images import (
-    ColourScales,
-    Thumbnail,
     field_renderer,
-    smooth,
     surface_renderer,
 )
-from bidnerf_core.localization.terms.rays import averaged
-from bidnerf_core.localization.terms.rendering import differentiate
 from bidnerf_core.localization.terms.surface import draw_numbers
 from bidnerf_core.mapping import States, descend
 from problems import FieldMap
@@ -110,7 +105,7 @@ def test_the_gradient_by_rays_is_the_numerical_one(
     monkeypatch: pytest.MonkeyPatch, field: RadianceField, depth: bool
 ) -> None:
     """Fields are float32, and the intervals that are sampled, which have no derivative, move with the rays."""
-    monkeypatch.setattr(rendering, "LEAST_WEIGHT", 0.0)
+    monkeypatch.setattr("bidnerf_core.fields.differentiation.LEAST_WEIGHT", 0.0)
     of_depth = DepthLossSettings(depth_loss="cauchy") if depth else None
     rays = draw_rays(problem(field), ColourSettings("cauchy"), of_depth, 100, 0)
     normal = rays(near())
@@ -123,7 +118,7 @@ def test_the_gradient_by_rays_is_the_numerical_one(
 def test_derivatives_of_rays_are_those_of_autograd_ray_by_ray(
     monkeypatch: pytest.MonkeyPatch, field: RadianceField
 ) -> None:
-    monkeypatch.setattr(rendering, "LEAST_WEIGHT", 0.0)
+    monkeypatch.setattr("bidnerf_core.fields.differentiation.LEAST_WEIGHT", 0.0)
     generator = torch.Generator().manual_seed(0)
     directions = T0.to(torch.float32).rotate(CAMERA.rays(CAMERA.pixel_centres().reshape(-1, 2)[::97])[0].float())
     origins = T0.translation.float() + 0.1 * torch.rand(directions.shape, generator=generator)
@@ -149,7 +144,7 @@ def test_rays_that_hit_nothing_have_no_derivative() -> None:
 
 def test_measured_rays_of_another_sensor_join_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     """They have no colour, and their distances alone lead back to the pose."""
-    monkeypatch.setattr(rendering, "LEAST_WEIGHT", 0.0)
+    monkeypatch.setattr("bidnerf_core.fields.differentiation.LEAST_WEIGHT", 0.0)
     lidar = depth_rays_of([observed(BLOBS)])
     blank = View(Frame("blank", torch.zeros((40, 48, 3)), CAMERA, has_colour=False), SE3.identity())
     given = rig(FieldMap(BLOBS, BOUNDS), [blank], T0, lidar)
@@ -273,8 +268,7 @@ def test_small_images_find_the_truth_at_another_exposure(factor: float) -> None:
     term, T = small_image()
     frame = baked.unseen()[0].frame
     exposed = replace(frame, rgb=(factor * frame.rgb).clamp(max=1))
-    wide = ColourScales(gain=1.0, rounds=5)
-    changed = replace(term, thumbnails=[Thumbnail.of(View(exposed, SE3.identity()), 24)], scales=wide)
+    changed = replace(term, thumbnails=[Thumbnail.of(View(exposed, SE3.identity()), 24)], gain=1.0, rounds=5)
     assert int(changed(States.cat([states_at(T[None]), near(T)])).cost.argmin()) == 0
 
 

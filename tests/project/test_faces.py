@@ -21,7 +21,6 @@ REASON = re.compile(r"^ *# Inside: .{10,}", re.MULTILINE)
 EXCEPTIONS = {
     "tests/conftest.py": "does in this process what a process of a comparison does",
     "tests/formats/test_scan_readers.py": "pictures that are no files, which every reader may have",
-    "tests/frames/test_masks.py": "hides pixels from everything that reads them, in whichever package",
     "tests/frames/test_pixel_store.py": "the memory that reading photos takes, which five packages share",
     "tests/maps/test_interrupted_saves.py": "interrupts every writer of files, in whichever package",
     "tests/maps/test_map_collections.py": "a worker of the service searches the collection that its maps form",

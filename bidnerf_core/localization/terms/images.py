@@ -13,61 +13,15 @@ from typing import ClassVar
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import conv2d, grid_sample, interpolate, normalize, pad
+from torch.nn.functional import normalize, pad
 
-from bidnerf_core.camera import Intrinsics
 from bidnerf_core.devices import constant, move_to
 from bidnerf_core.fields import RadianceField, SceneBounds, render
-from bidnerf_core.frames import View, inpaint
+from bidnerf_core.frames import Thumbnail, slopes, smooth
 from bidnerf_core.geometry import SE3, inlier_weight
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.terms.exposure import fit_exposure
 from bidnerf_core.mapping import CAMERA, Normal, P, States, SurfaceMap, cast, descend, true_intrinsics
-
-
-@dataclass(frozen=True, eq=False)
-class Thumbnail:
-    """A view resampled to a small camera without distortion."""
-
-    camera: Intrinsics
-    T_last_camera: SE3
-    rgb: Float[Tensor, "3 h w"]  # smoothed
-    flat: Float[Tensor, "n 3"]  # the pixels' points on the plane z = 1 of the camera frame, row by row
-    slopes: Float[Tensor, "3 n 2"]  # of the colours, per unit on that plane
-
-    @staticmethod
-    def of(view: View, width: int) -> Thumbnail:
-        """Return ``view`` undistorted, smoothed and reduced to at most ``width`` pixels on its longer side; on the CPU."""
-        camera = view.frame.intrinsics
-        small = replace(camera.scaled(min(1.0, width / max(camera.width, camera.height))), distortion=())
-        # Averaged first, so that every pixel of the image contributes.
-        rgb = inpaint(view.frame).cpu().float().permute(2, 0, 1)[None]
-        rgb = interpolate(rgb, (small.height, small.width), mode="area")
-        flat = small.unproject(small.pixel_centres())
-        if camera.distortion:
-            seen = 2 * camera.project(flat) / torch.tensor([camera.width, camera.height]) - 1
-            rgb = grid_sample(rgb, seen[None], padding_mode="border", align_corners=False)
-        rgb, T = smooth(rgb[0]), view.T_ref_camera.to("cpu", torch.float64)
-        return Thumbnail(small, T, rgb, flat.reshape(-1, 3), slopes(rgb, small))
-
-
-def smooth(image: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
-    """Convolve an image with a 5x5 binomial kernel, approximately a Gaussian of one pixel; the border is replicated."""
-    kernel = constant((1.0, 4.0, 6.0, 4.0, 1.0), image) / 16
-    flat = image.reshape(-1, 1, *image.shape[-2:])
-    flat = conv2d(pad(flat, (2, 2, 0, 0), mode="replicate"), kernel.view(1, 1, 1, 5))
-    flat = conv2d(pad(flat, (0, 0, 2, 2), mode="replicate"), kernel.view(1, 1, 5, 1))
-    return flat.view(image.shape)
-
-
-def slopes(image: Float[Tensor, "*b h w"], camera: Intrinsics) -> Float[Tensor, "*b n 2"]:
-    """Return the image's central differences to the right and down, per unit on the plane z = 1."""
-    flat = image.reshape(-1, 1, *image.shape[-2:])
-    wide = pad(flat, (1, 1, 1, 1), mode="replicate")
-    across = (wide[..., 1:-1, 2:] - wide[..., 1:-1, :-2]) * (camera.fx / 2)
-    down = (wide[..., 2:, 1:-1] - wide[..., :-2, 1:-1]) * (camera.fy / 2)
-    return torch.stack([across, down], -1).reshape(*image.shape[:-2], -1, 2)
-
 
 Renderer = Callable[[Float[Tensor, "r 3"], Float[Tensor, "r 3"]], tuple[Tensor, Tensor, Tensor]]
 """Renders rays, given their origins and unit directions (world). Returns their colours (r 3); a mask (r), 1 where the map renders the ray
@@ -109,22 +63,15 @@ def field_renderer(field: RadianceField, bounds: SceneBounds) -> Renderer:
     return rendered
 
 
-@dataclass(frozen=True)
-class ColourScales:
-    """Scales for comparing colours and for fitting an image's exposure relative to the map."""
-
-    # The offset's prior about 0 has a standard deviation of 0.1.
-    # norm of a pixel's colour difference (three channels) at which its inlier weight is 1/2
-    colour: float = 0.2
-    gain: float = 0.2  # standard deviation of the prior about 1
-    rounds: int = 2  # of reweighting for the exposure
+COLOUR = 0.2
+"""Norm of a pixel's colour difference (three channels) at which its inlier weight is one half."""
 
 
 @dataclass(frozen=True, eq=False)
 class Images:
     """Cost of small images: the mean over pixels of ``1 - 1 / (1 + c^2 / s^2)``, times ``INDEPENDENT``.
 
-    Here, c is the difference between rendered and measured colour, and s is ``ColourScales.colour``.
+    Here, c is the difference between rendered and measured colour, and s is ``COLOUR``.
 
     Colours are linearized with second-order accuracy, using the mean of both images' gradients (Benhimane and Malis 2004, "Real-time
     image-based tracking of planes using efficient second-order minimization"). Only the pose has derivatives. The cost is infinite for
@@ -136,7 +83,9 @@ class Images:
 
     renderer: Renderer
     thumbnails: Sequence[Thumbnail]
-    scales: ColourScales = ColourScales()
+    # Standard deviation of the prior of the exposure's gain about 1; that of the offset about 0 is 0.1.
+    gain: float = 0.2
+    rounds: int = 2  # of reweighting for the exposure
 
     @torch.no_grad()
     def __call__(self, states: States) -> Normal:
@@ -153,19 +102,18 @@ class Images:
     def _of_thumbnail(self, small: Thumbnail, T: SE3) -> tuple[Tensor, Tensor, Tensor]:
         """Return the cost, its gradient and its Hessian of one image."""
         rgb, known, points, depth = render_view(self.renderer, small, T)
-        scales = self.scales
         seen, measured, sure = rgb.mT, small.rgb.flatten(1).mT, known[..., None]
 
         def inlier(off: Tensor) -> Tensor:
-            return inlier_weight(off.square().sum(-1, keepdim=True), scales.colour)
+            return inlier_weight(off.square().sum(-1, keepdim=True), COLOUR)
 
         gain, offset = fit_exposure(
             seen,
             measured,
             lambda off: inlier(off).square().expand_as(off),
             sure,
-            ((scales.colour / scales.gain) ** 2, (scales.colour / 0.1) ** 2),
-            scales.rounds,
+            ((COLOUR / self.gain) ** 2, (COLOUR / 0.1) ** 2),
+            self.rounds,
         )
         corrected = gain * seen + offset
         error = corrected.clamp(0, 1) - measured
@@ -174,7 +122,7 @@ class Images:
         cost = (sure * (1 - near) + (1 - sure) * 0.7)[..., 0].mean(-1)
         # Where the camera clips, the colour does not depend on the pose.
         inside = (corrected - 0.5).abs() < 0.5
-        weight = inside * (sure * near.square() * (2 / scales.colour**2 / error.shape[1]))
+        weight = inside * (sure * near.square() * (2 / COLOUR**2 / error.shape[1]))
         slope = (slopes(rgb.unflatten(-1, small.rgb.shape[1:]), small.camera) + small.slopes) / 2
         # A point (X, Y, Z) is seen at x = X / Z, y = Y / Z, and moves there by (dX - x dZ, dY - y dZ) / Z.
         by_z = -(slope * small.flat[:, :2]).sum(-1, keepdim=True)

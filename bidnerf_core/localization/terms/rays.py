@@ -9,14 +9,21 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate, normalize, pad
+from torch.nn.functional import normalize, pad
 
 from bidnerf_core.devices import move_to
-from bidnerf_core.fields import Observations, RadianceField, SceneBounds, device_of, render
-from bidnerf_core.frames import Frame, View, inpaint
+from bidnerf_core.fields import (
+    Observations,
+    RadianceField,
+    SceneBounds,
+    channels,
+    device_of,
+    differentiate,
+    render,
+)
+from bidnerf_core.frames import View, averaged
 from bidnerf_core.geometry import Robust
 from bidnerf_core.localization.terms.exposure import eliminate, fit_exposure
-from bidnerf_core.localization.terms.rendering import channels, differentiate
 from bidnerf_core.localization.terms.surface import draw_numbers, sights_of
 from bidnerf_core.mapping import MOTION, Normal, Sights, States, rays_by_camera, rays_through
 
@@ -319,15 +326,3 @@ class ComparedRays:
         factor, _ = torch.linalg.cholesky_ex(unit[:, None] * hessian * unit + 1e-9 * eye)
         whitened = torch.linalg.solve_triangular(factor, unit[:, None] * scores.mT, upper=False)
         return (whitened.square().sum() / 6).sqrt().nan_to_num(0.0).clamp(0.005, 0.3)
-
-
-def averaged(frame: Frame, size: int) -> Float[Tensor, "h w 3"]:
-    """Return the colours averaged over squares of ``size`` pixels and interpolated between them; hidden pixels are filled in."""
-    height, width = frame.rgb_bytes.shape[:2]
-    size = min(size, height, width)
-    rgb = inpaint(frame).cpu().float().permute(2, 0, 1)[None]
-    small = avg_pool2d(rgb, size, ceil_mode=True, count_include_pad=False)
-    # Enlarged to whole squares, then cropped to the image, so that squares stay in place.
-    covered = (small.shape[2] * size, small.shape[3] * size)
-    smooth = interpolate(small, covered, mode="bilinear", align_corners=False)[..., :height, :width]
-    return smooth[0].permute(1, 2, 0)

@@ -14,16 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.devices import may_wait
-from bidnerf_core.fields import (
-    HitField,
-    RadianceField,
-    Rays,
-    Rendering,
-    derivatives_of,
-    query_samples,
-    render,
-    render_values,
-)
+from bidnerf_core.fields.contract import HitField, RadianceField, Rays, derivatives_of
+from bidnerf_core.fields.rendering import Rendering, query_samples, render, render_values
 
 LEAST_WEIGHT = 0.01
 """Rendering weight of a sample below which its derivatives are neglected: most samples lie in empty space."""
