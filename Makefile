@@ -28,7 +28,7 @@ SHOW_LONG = { grep --line-buffered -E 'Downloading .*(MB|GB)|^Installing collect
 .PHONY: help demo test slow robustness shapes check lint format page types arrows records release-records wheels docs clean
 
 help: ## this list
-	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/^([a-z-]+):[^#]*## /  make \1\t/' | expand -t 18
+	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/^([a-z-]+):[^#]*## /  make \1\t/' | expand -t 24
 
 demo: $(VENV)/.installed-demo ## train a small scene, find poses in it, draw the result in demo-out/
 	@$(BIN)/bidnerf demo --out $(DEMO_OUT) --overwrite

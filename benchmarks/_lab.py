@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import os
+import random
 import statistics
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -20,6 +22,7 @@ from bidnerf import Localization, Map, View, load_map
 from bidnerf.evaluation import provenance, script_command
 from bidnerf.results import normalized_error_squared, pose_error, success_rate
 from bidnerf_core.datasets import Capture, open_dataset
+from bidnerf_core.errors import InputError
 from bidnerf_core.io import FileInUse, take_lock, to_plain, write_file
 
 RESULTS = Path(__file__).resolve().parent / "results"
@@ -28,6 +31,15 @@ LIMITS = {"5deg 0.05": (0.05, 5.0), "1deg 0.02": (0.02, 1.0)}
 RIGHT, STRICT = LIMITS
 BOUND = float(chi2.ppf(0.95, 6))
 """Normalised squared error below which nineteen of twenty errors lie if the covariance is right."""
+
+FRAMES = 24
+"""Frames of each map and mode that ``answers.py`` shows under a condition whose share is 1."""
+FEWEST = 15
+"""Number of frames without those for tuning from which the latter are left out."""
+CONFIG = {"steps": 1500, "seed": 0}
+"""Settings with which ``answer_maps.py`` trains maps."""
+VERSION = 1
+"""Goes up with every change of the code that changes maps."""
 
 Row = dict[str, Any]
 
@@ -38,8 +50,19 @@ def held_out(names: Sequence[str], tuning: bool = False, count: int | None = Non
     Frames whose index is 1 modulo 5 are for tuning.
     """
     chosen = [name for place, name in enumerate(names) if (place % 5 == 1) == tuning]
-    kept = min(count or len(chosen), len(chosen))
-    return [chosen[place * len(chosen) // kept] for place in range(kept)]
+    return spread(chosen, count or len(chosen))
+
+
+def spread(names: Sequence[str], count: int) -> list[str]:
+    """Return ``count`` evenly spaced names, or all if there are fewer."""
+    count = min(count, len(names))
+    return [names[place * len(names) // count] for place in range(count)]
+
+
+def without_tuning(names: Sequence[str]) -> list[str]:
+    """Return the frames of a test split without those for tuning, or all if fewer than ``FEWEST`` would remain."""
+    others = held_out(names)
+    return others if len(others) >= FEWEST else list(names)
 
 
 def one_thread() -> None:
@@ -56,10 +79,72 @@ def parser(
     if named:
         found.add_argument("--name", default=name, required=name is None, help="of the record (default: %(default)s)")
     if scenes:
-        found.add_argument("scenes", nargs="+", metavar="MAP:DATA", help="folder of a map, folder of its dataset")
+        found.add_argument(
+            "scenes",
+            nargs="+",
+            metavar="SCENE",
+            help="MAP:DATA, folders of a map and of its dataset, or a name as answer_maps.py takes it",
+        )
         found.add_argument("--frames", type=int, help="test frames of each scene, evenly spaced (default: all)")
         found.add_argument("--tuning-frames", action="store_true", help="only frames that settings are tuned on")
     return found
+
+
+# Datasets, and maps of them.
+
+
+def folder_of(variable: str) -> Path:
+    """Return the folder that a variable of the environment names."""
+    value = os.environ.get(variable)
+    if not value:
+        raise InputError(f"{variable} is not set, expected a folder")
+    return Path(value)
+
+
+def data_folder(scene: str) -> Path:
+    """Return the folder of the dataset of SCENE, SCENE@K or SCENE@new."""
+    return folder_of("BIDNERF_DATA") / scene.partition("@")[0]
+
+
+def capture_of(scene: str, background: tuple[float, float, float] | None = None) -> Capture:
+    """Return the dataset of SCENE, that of SCENE@K with half K of its training images, or that of SCENE@new.
+
+    SCENE@new is trained on every second training image. Held out are the others, if they have depth where the test images have,
+    and the test images that ``answers.py`` does not show under the name SCENE.
+    """
+    capture, part = open_dataset(data_folder(scene), background), scene.partition("@")[2]
+    train = [place for place, shot in enumerate(capture.shots) if "train" in shot.splits]
+    if part == "new":
+        test = [place for place, shot in enumerate(capture.shots) if "test" in shot.splits]
+        shown = set(spread(without_tuning(capture.frame_names("test")), FRAMES))
+        left = [place for place in test if capture.shots[place].name not in shown]
+        if (capture.shots[train[0]].depth is None) == (capture.shots[test[0]].depth is None):
+            left += train[1::2]
+        splits = dict.fromkeys(train[::2], "train") | dict.fromkeys(left, "test")
+        shots = [replace(capture.shots[place], splits=(split,)) for place, split in sorted(splits.items())]
+        return replace(capture, shots=shots)
+    left_out = set(random.Random(int(part)).sample(train, len(train) // 2)) if part else set()
+    return replace(capture, shots=[shot for place, shot in enumerate(capture.shots) if place not in left_out])
+
+
+def map_folder(scene: str) -> Path:
+    """Return the folder of a scene's map, whether the map has been trained or not."""
+    data = data_folder(scene)
+    if not data.is_dir():
+        raise InputError(f"{data}: no such folder, expected a dataset; BIDNERF_DATA names the folder of all")
+    hashed = hashlib.blake2b(json.dumps([VERSION, CONFIG], sort_keys=True).encode(), digest_size=6)
+    for path in sorted(path for path in data.rglob("*") if path.is_file()):
+        with path.open("rb") as file:
+            hashed.update(str(path.relative_to(data)).encode() + hashlib.file_digest(file, "blake2b").digest())
+    return folder_of("BIDNERF_MAPS") / f"{scene}-{hashed.hexdigest()}"
+
+
+def require_map(scene: str) -> Path:
+    """Return the folder of a scene's map. Raises ``InputError`` if it has not been trained."""
+    folder = map_folder(scene)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such map, expected one; answer_maps.py {scene} trains it")
+    return folder
 
 
 @dataclass(frozen=True)
@@ -73,10 +158,14 @@ class Scene:
 
     @classmethod
     def open(cls, pair: str) -> Scene:
-        """Open ``MAP:DATA``."""
-        folder, data = map(Path, pair.split(":", 1))
+        """Open ``MAP:DATA``, or a scene that ``answer_maps.py`` has trained, by name."""
+        if ":" in pair:
+            folder, data = map(Path, pair.split(":", 1))
+            stored = load_map(folder)
+            return cls(folder, data, stored, open_dataset(data, stored.bounds.background))
+        folder, data = require_map(pair), data_folder(pair)
         stored = load_map(folder)
-        return cls(folder, data, stored, open_dataset(data, stored.bounds.background))
+        return cls(folder, data, stored, capture_of(pair, stored.bounds.background))
 
     @property
     def name(self) -> str:

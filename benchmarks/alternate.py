@@ -22,8 +22,20 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from _lab import RIGHT, STRICT, Row, held_out, in_turn, judgement, parser, record, times_slower, within
-from answer_maps import folder_of, map_folder
+from _lab import (
+    RIGHT,
+    STRICT,
+    Row,
+    folder_of,
+    held_out,
+    in_turn,
+    judgement,
+    map_folder,
+    parser,
+    record,
+    times_slower,
+    within,
+)
 from tracking import SEQUENCES
 
 from bidnerf_core.datasets import open_dataset

@@ -1,12 +1,13 @@
 r"""Answers on record: what the localizer says to the same images, before and after a change of its code.
 
     python benchmarks/answer_maps.py MAP [MAP ...]
-    python benchmarks/answers.py MAP [MAP ...] --out A.jsonl [--share 0.1] [--only CONDITION ...]
+    python benchmarks/answers.py MAP [MAP ...] --name NAME [--share 0.1] [--only CONDITION ...]
+    python benchmarks/answers.py MAP [MAP ...] --out A.jsonl
     python benchmarks/answers.py --compare A.jsonl [B.jsonl]
-    python benchmarks/answers.py --record A.jsonl [A2.jsonl ...] [--name answers]
+    python benchmarks/answers.py --record A.jsonl [A2.jsonl ...] --name NAME
 
-MAP is the name of a dataset in the folder ``BIDNERF_DATA``, or that name, @ and the number of a half of its training images, whose map ``answer_maps.py`` has put into the folder
-``BIDNERF_MAPS``, or ``planes``, the scenes of ``planar_scenes.py``. Images that training never saw are localized without a
+MAP is the name of a dataset in the folder ``BIDNERF_DATA``, or that name with @K or @new, whose map ``answer_maps.py`` has put into the
+folder ``BIDNERF_MAPS``; or ``planes``, the scenes of ``planar_scenes.py``. Images that training never saw are localized without a
 start and on one thread, with depth and without, under the conditions that the table ``CONDITIONS`` lists. Each answer is kept
 as a row with its pose, covariance (upper triangle, single precision), outcome, reason, confidence, errors and CPU time. The
 same code gives the same rows on the same maps, to the bit, but for the time. An interrupted run resumes; several may run at a
@@ -23,7 +24,7 @@ scenes differ in size, errors of the position are relative to the distance of wh
 right (1 degree, 0.02), accepted, and silent (accepted and not right); how many of the accepted with a known error lie inside
 the 95 % bound of their covariance; the median squared error of the right ones, in units of the covariance and relative to the
 median of its distribution (1 for a true covariance); and the median and the longest CPU time. Exact McNemar tests of both files follow, and how
-many answers changed. ``--record`` joins files into ``results/NAME.rows.jsonl.xz``, and summarises them in
+many answers changed. ``--name`` joins the rows, or files of them, into ``results/NAME.rows.jsonl.xz``, and summarises them in
 ``results/NAME.json``.
 """
 
@@ -44,23 +45,26 @@ from typing import Any
 
 import planar_scenes
 import torch
+from _doubled_map import double, far_away
 from _lab import (
+    FRAMES,
     RESULTS,
     STRICT,
     Row,
     RowStore,
     Scene,
     cpu_seconds,
+    data_folder,
     errors_of,
-    held_out,
+    folder_of,
     judgement,
     one_thread,
     record,
+    spread,
     within,
     without_depth,
+    without_tuning,
 )
-from answer_maps import data_folder, folder_of, map_folder
-from repeated_scene import copies, double
 from scipy.stats import binomtest, chi2
 from torch import Generator, Tensor
 from torch.nn.functional import interpolate
@@ -75,10 +79,6 @@ from bidnerf_core.io import write_file
 from bidnerf_core.localization import Evidence, Outcome, judge
 
 SEED = 0
-FRAMES = 24
-"""Frames of each map and mode under a condition whose share is 1."""
-FEWEST = 15
-"""Number of frames without those for tuning from which the latter are left out."""
 SCENES = ("phone_doll", "tum_fr1_xyz", "room_living", "blender_lego", "iphone_corridor", "blender_mic")
 """Photos of the next two count as photos of another scene."""
 PLANES = "planes"
@@ -209,18 +209,13 @@ CONDITIONS = {
     "two averaged": Condition(share=0.34, special=True),
     "depth 3 %": Condition("depth-scale:1.03", needs_depth=True),
     "depth 10 px": Condition("depth-shift:10", needs_depth=True),
-    "other scene": Condition(share=0.25, has_answer=False, special=True),
-    "twice": Condition(share=0.25, has_answer=False, special=True),
-    "plain wall": Condition(wall, 0.17, has_answer=False),
+    "other scene": Condition(share=1.0, has_answer=False, special=True),
+    "twice": Condition(share=0.5, has_answer=False, special=True),
+    "twice, start 5 deg": Condition(share=0.5, special=True),
+    "plain wall": Condition(wall, 0.5, has_answer=False),
     "start 5 deg": Condition(share=0.5, special=True),
     "plane": Condition(special=True),
 }
-
-
-def spread(names: Sequence[str], count: int) -> list[str]:
-    """Return ``count`` evenly spaced names, or all if there are fewer."""
-    kept = min(count, len(names))
-    return [names[place * len(names) // kept] for place in range(kept)]
 
 
 # Questions, and answers to them.
@@ -286,11 +281,8 @@ class Subject:
     """A map that is asked, and the images of its scene and of others."""
 
     def __init__(self, name: str) -> None:
-        folder = map_folder(name)
-        if not folder.is_dir():
-            raise InputError(f"{folder}: no such map, expected one; answer_maps.py {name} trains it")
         self.name = name
-        self.scene = Scene.open(f"{folder}:{data_folder(name)}")
+        self.scene = Scene.open(name)
         self.content = self.scene.key
         self.localizer = Localizer(self.scene.map)
         scene = data_folder(name).name
@@ -300,9 +292,7 @@ class Subject:
     @cached_property
     def frames(self) -> list[str]:
         """The frames of the test split without those for tuning, or all if too few would remain."""
-        names = self.scene.dataset.frame_names("test")
-        kept = held_out(names)
-        return kept if len(kept) >= FEWEST else list(names)
+        return without_tuning(self.scene.dataset.frame_names("test"))
 
     @cached_property
     def foreign(self) -> dict[str, tuple[Capture, str]]:
@@ -318,7 +308,7 @@ class Subject:
 
     @cached_property
     def localizer_of_two(self) -> Localizer:
-        return Localizer(double(self.scene.map, copies(self.scene.map.bounds)[0]))
+        return Localizer(double(self.scene.map, far_away(self.scene.map.bounds)))
 
     def dataset(self, name: str) -> Capture:
         return open_dataset(folder_of("BIDNERF_DATA") / name, self.scene.map.bounds.background)
@@ -359,7 +349,7 @@ class Subject:
             other = self.view(self.frames[(self.frames.index(name) + len(self.frames) // 2) % len(self.frames)])
             view = replace(view, frame=replace(view.frame, rgb=(view.frame.rgb + other.frame.rgb) / 2))
             right = [given, other]
-        elif condition == "start 5 deg":
+        elif condition.endswith("start 5 deg"):
             start = self.start(given)
         elif isinstance(how.change, str):
             view = faulty(view, how.change, SEED)
@@ -368,7 +358,7 @@ class Subject:
             view = replace(view, frame=how.change(view.frame))
         if mode == "RGB":
             view = without_depth(view)
-        localizer = self.localizer_of_two if condition == "twice" else self.localizer
+        localizer = self.localizer_of_two if condition.startswith("twice") else self.localizer
         return Question(key, view.frame, localizer, right if how.has_answer else (), start)
 
     def start(self, view: View) -> SE3:
@@ -593,7 +583,7 @@ def main() -> None:
     found.add_argument("--only", nargs="+", default=(), choices=CONDITIONS, metavar="CONDITION", help="conditions")
     found.add_argument("--compare", nargs="+", type=Path, metavar="ROWS", help="one or two files of rows")
     found.add_argument("--record", nargs="+", type=Path, metavar="ROWS", help="files of rows to join")
-    found.add_argument("--name", default="answers", help="of the record (default: %(default)s)")
+    found.add_argument("--name", help="of the record")
     given = found.parse_args()
     if [bool(given.maps), bool(given.compare), bool(given.record)].count(True) != 1:
         found.error("expected maps, or --compare, or --record")
@@ -601,13 +591,16 @@ def main() -> None:
         if len(given.compare) > 2:
             found.error(f"--compare has {len(given.compare)} files, expected one or two")
         compare(given.compare)
-    elif given.record:
-        keep(given.record, given.name)
-    else:
-        if given.out is None or not 0 < given.share <= 1:
-            found.error("expected --out FILE for the rows of maps, and a --share above 0 and up to 1")
+        return
+    rows = given.record
+    if given.maps:
+        if not (given.out or given.name) or not 0 < given.share <= 1:
+            found.error("expected --name or --out FILE for the rows of maps, and a --share above 0 and up to 1")
         one_thread()
-        run(given.maps, given.out, given.share, given.only)
+        rows = [given.out or RESULTS / f"{given.name}.rows.jsonl"]
+        run(given.maps, rows[0], given.share, given.only)
+    if given.name:
+        keep(rows, given.name)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 r"""Contribution of each part of method ``auto``: landmarks, the surface, rendered rays, with and without depth.
 
-    python benchmarks/auto_terms.py MAP:DATA [MAP:DATA ...] --name auto_terms
+    python benchmarks/auto_terms.py SCENE [SCENE ...] [--rgb] --name auto_terms
 
 No start is given. Maps need landmarks (``bidnerf train`` and ``bidnerf bake --data`` build them). Finished frames are kept, so
 that an interrupted run resumes where it stopped. Without depth, the surface alone takes many seconds per image; ``--slow``
@@ -9,6 +9,7 @@ tries that as well.
 
 from __future__ import annotations
 
+from argparse import Namespace
 from functools import partial
 from typing import Any
 
@@ -38,12 +39,12 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
-def scene_results(scene: Scene, tuning: bool, count: int | None, slow: bool, store: RowStore) -> dict[str, Any]:
+def scene_results(scene: Scene, given: Namespace, store: RowStore) -> dict[str, Any]:
     """Try all variants on the frames of one scene, as RGB and, where there is depth, as RGB-D."""
     found: dict[str, Any] = {}
-    for mode, views in modes(scene.views(tuning, count)).items():
+    for mode, views in modes(scene.views(given.tuning_frames, given.frames), given.modes).items():
         for label, settings in VARIANTS.items():
-            if label == SLOW and mode == "RGB" and not slow:
+            if label == SLOW and mode == "RGB" and not given.slow:
                 continue
             localizer = Localizer(scene.map, "auto", settings_of("auto", settings))
             kind = f"{mode}, {label}"
@@ -63,13 +64,14 @@ def scene_results(scene: Scene, tuning: bool, count: int | None, slow: bool, sto
 def main() -> None:
     arguments = parser(__doc__, "auto_terms", scenes=True)
     arguments.add_argument("--slow", action="store_true", help="try the surface alone without depth, too")
+    arguments.add_argument("--rgb", dest="modes", action="store_const", const=("RGB",), default=("RGB", "RGB-D"))
     given = arguments.parse_args()
     one_thread()
     with RowStore(RESULTS / f"{given.name}.rows.jsonl") as store:
         scenes = map(Scene.open, given.scenes)
         record(
             given.name,
-            {s.name: scene_results(s, given.tuning_frames, given.frames, given.slow, store) for s in scenes},
+            {s.name: scene_results(s, given, store) for s in scenes},
         )
 
 

@@ -1,6 +1,7 @@
 """Variants of ``bid``, each tried on its own from the same starts, on the frames on which settings are tuned.
 
     python benchmarks/bid_variants.py DATA --map MAP --out FOLDER [--group schedule reach depth] [--variant NAME ...]
+    python benchmarks/bid_variants.py SCENE [--group schedule reach depth] [--variant NAME ...]
 
 - ``schedule``: what the paper leaves unspecified: learning rate, its decay, the frame of updates, the scale of the Huber loss;
 - ``reach``: what may widen the basin of convergence from 0.9, 1.7 and 3.4 units;
@@ -14,12 +15,13 @@ has a file of results in FOLDER, which survives a kill at any moment: the same c
 from __future__ import annotations
 
 import json
+from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import _lab
-from paper_tables import Settings, as_record, run_part, test_frames, trials_of
+from paper_tables import Settings, as_record, run_part, scene_of, test_frames, trials_of
 
 from bidnerf.evaluation import Plan
 
@@ -75,41 +77,45 @@ GROUPS: dict[str, tuple[Settings, dict[str, Settings], tuple[float, ...]]] = {
 """The settings that all variants of a group share, the variants, and the sizes of the starts."""
 
 
-def plans(group: str, base: Plan, names: list[str] | None, sizes: list[float] | None) -> list[Plan]:
+def plans(group: str, base: Plan, given: Namespace, common: Settings) -> list[Plan]:
     """Return a plan for each variant of a group, or only for the named ones."""
-    common, variants, usual = GROUPS[group]
-    starts = tuple((size,) for size in sizes or usual)
+    _, variants, usual = GROUPS[group]
+    starts = tuple((size,) for size in given.size or usual)
     return [
         replace(base, sizes=starts, config=json.dumps(common | changed, sort_keys=True))
         for name, changed in variants.items()
-        if names is None or name in names
+        if given.variant is None or name in given.variant
     ]
 
 
 def main() -> None:
     parser = _lab.parser(__doc__, named=False)
     parser.add_argument("data")
-    parser.add_argument("--map", required=True)
+    parser.add_argument("--map", help="a folder (default: the map of SCENE, see answer_maps.py)")
     parser.add_argument("--out", type=Path, default=_lab.RESULTS)
     parser.add_argument("--group", nargs="+", choices=list(GROUPS), default=list(GROUPS))
     parser.add_argument("--variant", nargs="+", help="only these of the groups")
     parser.add_argument("--size", nargs="+", type=float, help="errors of the start; default: the group's")
+    parser.add_argument("--rays", type=int, help="default: the group's, 512")
+    parser.add_argument("--steps", type=int, help="default: the group's")
     parser.add_argument("--trials", type=int, default=8, help="of each variant and size")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--stop-after", type=float, help="minutes")
     given = parser.parse_args()
-    frames = test_frames(given.map, given.data, tuning=True)
+    scene = scene_of(given.data, given.map)
+    frames = test_frames(*scene, tuning=True)
     base = Plan(protocol="bid", method="bid", trials=given.trials, seed=given.seed, frames=frames, device=given.device)
+    own: Settings = {name: value for name, value in (("rays", given.rays), ("max_steps", given.steps)) if value}
     for group in given.group:
-        chosen = plans(group, base, given.variant, given.size)
+        common, variants = GROUPS[group][0] | own, GROUPS[group][1]
+        chosen = plans(group, base, given, common)
         # One trial of every variant, then the next, so that the results at any moment compare all variants.
-        rounds = zip(*(trials_of(plan, (given.map, given.data)) for plan in chosen), strict=True)
+        rounds = zip(*(trials_of(plan, scene) for plan in chosen), strict=True)
         trials = [trial for same in rounds for trial in same]
-        name = f"bid_{group}_{trials[0].portable.map.replace(':', '_')}"
+        name = f"bid_{group}_{trials[0].portable.map.replace(':', '_') if given.map else given.data}"
         groups = run_part(trials, given.out / f"{name}.jsonl", given.workers, given.stop_after)
-        common, variants, _ = GROUPS[group]
         results: dict[str, Any] = {"common_settings": common, "variants": variants, **as_record(groups)}
         _lab.record(name, results, given.seed, given.out)
 

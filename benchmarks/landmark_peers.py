@@ -1,6 +1,6 @@
 r"""Compare method ``auto`` with the simplest other ways to localize a camera, on the same map and frames.
 
-    python benchmarks/landmark_peers.py MAP:DATA [MAP:DATA ...] --name landmark_peers
+    python benchmarks/landmark_peers.py SCENE [SCENE ...] --name landmark_peers
 
 From images alone, without a start:
 
@@ -20,8 +20,8 @@ Settings of the point cloud methods are tuned for each scene on the frames for t
 rooms, or 2 % of the extent of an object. Peers take turns, frame by frame, in one process of one thread. CPU times begin with
 the frame in memory and the map's points, features and trees built.
 
-Libraries that are not installed are skipped: ``pip install -e '.[sfm]' --group peers`` installs all but Open3D, which is large: give it
-an environment of its own. Triangulated points are kept in ``--cache`` by the content of the images, and finished rows next to
+Libraries that are not installed are skipped: ``pip install -e '.[sfm]' --group peers`` installs all but Open3D, which is large
+(``open3d-cpu``). Triangulated points are kept in ``--cache`` by the content of the images, and finished rows next to
 the record, so that an interrupted run resumes where it stopped.
 """
 

@@ -1,6 +1,9 @@
 """The tables of BID-NeRF (Csehi and Jozsa 2023) and the starts of other papers, on given maps, with the paper's settings.
 
     python benchmarks/paper_tables.py DATA --map MAP [--map MAP ...] --out FOLDER [--part table1 ...]
+    python benchmarks/paper_tables.py SCENE [--part table1 ...]
+
+SCENE is a name as ``answer_maps.py`` takes it, for the map that it has trained.
 
 - ``table1``: fine or coarse x RGB or RGB-D, one image, e_t 0.5, 0.8 and 1.2 together;
 - ``depth_weight``: the cells of ``table1`` that have depth, with a tenth of its weight;
@@ -246,6 +249,11 @@ def preset_settings(preset: str, others: Settings, method: str) -> Settings:
     return json.loads(changed_settings(method, chosen)) | others
 
 
+def scene_of(data: str, folder: str | None) -> Scene:
+    """Return a map and its dataset; without ``folder``, those of a scene that ``answer_maps.py`` has trained."""
+    return (folder, data) if folder else (str(_lab.require_map(data)), str(_lab.data_folder(data)))
+
+
 def test_frames(map_folder: str, data: str, tuning: bool) -> tuple[str, ...]:
     """Return the test frames on which settings are tuned, or all others."""
     _, dataset = open_scene(map_folder, data)
@@ -341,7 +349,7 @@ def as_record(groups: Sequence[ResultGroup]) -> dict[str, Any]:
 def main() -> None:
     parser = _lab.parser(__doc__, named=False)
     parser.add_argument("data")
-    parser.add_argument("--map", action="append", required=True, help="a folder; may be given again")
+    parser.add_argument("--map", action="append", help="a folder; may be given again (default: the map of SCENE)")
     parser.add_argument("--out", type=Path, default=_lab.RESULTS)
     parser.add_argument("--part", nargs="+", choices=list(PARTS), default=list(PARTS))
     parser.add_argument("--preset", choices=list(METHODS["bid"].presets), default="paper")
@@ -357,11 +365,11 @@ def main() -> None:
     own: Settings = {"rays": given.rays} | ({} if given.steps is None else {"max_steps": given.steps})
     common = partial(preset_settings, given.preset, own | json.loads(given.config))
     for part in given.part:
-        for folder in given.map:
-            scene = folder, given.data
+        for folder in given.map or [None]:
+            scene = scene_of(given.data, folder)
             base = Plan(method="bid", seed=given.seed, device=given.device, frames=test_frames(*scene, tuning=False))
             trials = [trial for cell in PARTS[part](base, common, given.trials, scene) for trial in cell]
-            name = f"{part}_{trials[0].portable.map.replace(':', '_')}"
+            name = f"{part}_{trials[0].portable.map.replace(':', '_') if folder else given.data}"
             groups = run_part(trials, given.out / f"{name}.jsonl", given.workers, given.stop_after)
             results = {"paper_percent": PAPER.get(part), "preset": given.preset, **as_record(groups)}
             _lab.record(name, results, given.seed, given.out)

@@ -1,12 +1,12 @@
-r"""Quick maps: how long ``train --quick`` takes, and what its maps answer, beside the maps of ``answers``.
+r"""Quick maps: how long ``train --quick`` takes, and what its maps answer, beside maps of more steps.
 
-    BIDNERF_DATA=FOLDER python benchmarks/quick_maps.py SCENE [SCENE ...] --out DIR [--name quick_maps]
+    BIDNERF_DATA=FOLDER BIDNERF_MAPS=FOLDER python benchmarks/quick_maps.py SCENE [SCENE ...] [--default SCENE ...]
 
 SCENE is the name of a dataset in the folder ``BIDNERF_DATA``. Each map is trained with the default backend's quick settings on
-one thread, into a folder of DIR, and then localizes, without a start, the images of the record ``answers`` under the condition
-"as it is", with depth and without. The answers of the record are those of the map with 1500 steps of the default settings.
-Times are CPU times, which other work on the machine hardly changes: a machine with two cores takes little more than half of
-them. A map that is already in DIR is used as it is, with the times stored beside it.
+one thread. It and the map that ``answer_maps.py`` has trained with 1500 steps of the default settings then localize, without a start,
+the images of the test split, with depth and without. The scenes of ``--default`` are also trained with all default settings, for the
+time alone. Times are CPU times, which other work on the machine hardly changes: a machine with two cores takes little more than half of
+them. Maps go into folders of ``--out``; one that is there is used as it is, with the times stored beside it.
 """
 
 from __future__ import annotations
@@ -18,14 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import _lab
-from _lab import RESULTS, Row
-from answer_maps import folder_of
-from answers import answers_of, read_rows, summary
+from _lab import RESULTS, Row, Scene
+from answers import summary
 
 import bidnerf as bn
 from bidnerf_core.progress import Progress
 
-CONDITION = "as it is"
 SHOWN = ("n", "right", "strict", "accepted", "silent")
 
 
@@ -45,12 +43,12 @@ class StageTimes:
         self._stage, self._began = following, now
 
 
-def train_quick(data: Path, folder: Path) -> Row:
-    """Train a quick map, unless it is there, and return its times."""
+def train_timed(data: Path, folder: Path, config: str | None) -> Row:
+    """Train a map, unless it is there, and return its times."""
     stored = folder.with_name(f"{folder.name}.json")
     if not stored.exists():
         stages = StageTimes()
-        scene = bn.train(data, out=folder, config="quick", options=bn.TrainOptions(overwrite=True), progress=stages)
+        scene = bn.train(data, out=folder, config=config, options=bn.TrainOptions(overwrite=True), progress=stages)
         stages.end()
         times = {"cpu_minutes": sum(stages.seconds.values()) / 60, "photos": len(scene.info.cameras)}
         stored.write_text(json.dumps(times | {"steps": scene.info.step, "cpu_seconds_of_stages": stages.seconds}))
@@ -61,29 +59,24 @@ def train_quick(data: Path, folder: Path) -> Row:
 def main() -> None:
     parser = _lab.parser(__doc__, "quick_maps")
     parser.add_argument("scenes", nargs="+", metavar="SCENE")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the maps")
+    parser.add_argument("--default", nargs="+", default=(), metavar="SCENE", help="trained with default settings, too")
+    parser.add_argument("--out", type=Path, default=RESULTS.parent / "cache" / "quick_maps", metavar="DIR")
     given = parser.parse_args()
     _lab.one_thread()
-    known = answers_of(read_rows(RESULTS / "answers.rows.jsonl.xz"))
-    result: dict[str, Any] = {}
+    quick: dict[str, Any] = {}
     for name in given.scenes:
-        data = folder_of("BIDNERF_DATA") / name
-        about = train_quick(data, given.out / name)
-        localizer, dataset = bn.Localizer(given.out / name), bn.open_dataset(data)
-        result[name] = about | {"answers": {}}
-        for mode in ("RGB", "RGB-D"):
-            default = {key[3]: row for key, row in known.items() if key[:3] == (name, mode, CONDITION)}
-            rows = []
-            for view in dataset.views("test", list(default)) if default else []:
-                view = view if mode == "RGB-D" else _lab.without_depth(view)
-                rows.append(_lab.answer(partial(localizer, view.frame), view))
-            if rows:
-                both = {"quick": summary(rows), "default": summary(list(default.values()))}
-                result[name]["answers"][mode] = {
-                    which: {part: counts[part] for part in SHOWN} for which, counts in both.items()
-                }
-        print(name, json.dumps(result[name]), flush=True)
-    _lab.record(given.name, result)
+        scene, about = Scene.open(name), train_timed(_lab.data_folder(name), given.out / name, "quick")
+        localizers = {"quick": bn.Localizer(given.out / name), "default": bn.Localizer(scene.map)}
+        quick[name] = about | {"answers": {}}
+        for mode, views in _lab.modes(scene.dataset.views("test")).items():
+            rows = {
+                which: summary([_lab.answer(partial(localizer, view.frame), view) for view in views])
+                for which, localizer in localizers.items()
+            }
+            quick[name]["answers"][mode] = {which: {part: r[part] for part in SHOWN} for which, r in rows.items()}
+        print(name, json.dumps(quick[name]), flush=True)
+    default = {name: train_timed(_lab.data_folder(name), given.out / f"{name}-default", None) for name in given.default}
+    _lab.record(given.name, {"quick": quick, "default": default})
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
 from functools import cache
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
 ROOT = Path(__file__).parents[1]
@@ -57,6 +58,9 @@ MEASURED: Mapping[str, Sequence[str]] = {
     "": LOCALIZATION,
 }
 """The folders on which records depend, by the beginnings of their names; the first that fits counts."""
+
+OF_OTHERS = {"risk"}
+"""Records that are made from those of others, when these are there."""
 
 
 def cited(root: Path) -> list[str]:
@@ -110,6 +114,7 @@ def make(root: Path, name: str, command: str) -> str:
     if not begun.exists() or changes(root, name, *begun.read_text().split()):
         for rows in results.glob(f"{name}.*jsonl"):
             rows.unlink()
+        rmtree(root / "benchmarks" / "cache" / name, ignore_errors=True)
         begun.write_text(f"{head} {datetime.now().isoformat()}")
     with (results / f"{name}.log").open("w") as log:
         words = [sys.executable, *shlex.split(command)[1:]]
@@ -142,12 +147,15 @@ def main(arguments: Sequence[str] | None = None, root: Path = ROOT) -> int:
         needless = known.keys() - stale.keys()
         faults += [f"{name} is listed, but not out of date or not cited: --accept" for name in sorted(needless)]
     if given.make:
-        possible = {name: record["command"] for name, record in stale.items() if not record.get("gpu")}
-        with ThreadPoolExecutor(2) as two:
-            faults = []
-            for line in two.map(lambda name: make(root, name, possible[name]), possible):
-                print(line, flush=True)
-                faults += [line] if "FAILED" in line else []
+        possible = [name for name, record in stale.items() if not record.get("gpu")]
+        faults = []
+        for names in (set(possible) - OF_OTHERS, set(possible) & OF_OTHERS):
+            with ThreadPoolExecutor(2) as two:
+                for line in two.map(
+                    lambda name: make(root, name, stale[name]["command"]), sorted(names) if not faults else ()
+                ):
+                    print(line, flush=True)
+                    faults += [line] if "FAILED" in line else []
     elif given.accept:
         head = "# Cited records that are older than the last change of what they measure, with their commits: see ../stale.py\n"
         lines = (f"{name} {record['commit'][:10]}\n" for name, record in stale.items())

@@ -35,8 +35,7 @@ from typing import Any
 import cv2
 import torch
 import torch.nn.functional as F
-from _lab import RESULTS, RowStore, one_thread, parser, record
-from answer_maps import folder_of, map_folder
+from _lab import RESULTS, RowStore, folder_of, map_folder, one_thread, parser, record
 
 from bidnerf import SE3, Frame, Localization, Localizer, Map, Outcome, Tracker, load_map
 from bidnerf.results import TrajectoryErrors, pose_error, spans, within

@@ -9,6 +9,8 @@ from types import ModuleType
 
 import pytest
 
+from bidnerf import SE3, Intrinsics
+from bidnerf_core.datasets import Capture, DepthFile, Shot
 from bidnerf_core.io import FileInUse
 from refusals import refused
 
@@ -57,3 +59,35 @@ def test_a_record_holds_its_results_and_how_they_were_made(script: Script, tmp_p
     with pytest.raises(ValueError, match="not JSON compliant"):
         script("_lab").record("speed", {"rate": float("nan")}, seed=3, folder=tmp_path / "new")
     assert json.loads(path.read_text()) == record
+
+
+@pytest.mark.parametrize(("depths", "held_out"), [((True, True), 16 + 10 + 6), ((False, True), 16 + 10)])
+def test_a_scene_is_split_anew_into_images_that_were_not_shown_before(
+    script: Script, monkeypatch: pytest.MonkeyPatch, depths: tuple[bool, bool], held_out: int
+) -> None:
+    lab = script("_lab")
+    camera = Intrinsics(30.0, 30.0, 16.0, 12.0, 32, 24)
+    shots = [
+        Shot(
+            image=Path(f"{split}_{number}.png"),
+            camera=camera,
+            T_world_camera=SE3.identity(),
+            depth=DepthFile("none", lambda: None) if has_depth else None,
+            splits=(split,),
+        )
+        for split, count, has_depth in (("train", 12, depths[0]), ("test", 50, depths[1]))
+        for number in range(count)
+    ]
+    monkeypatch.setenv("BIDNERF_DATA", "data")
+    monkeypatch.setattr(lab, "open_dataset", lambda *_: Capture(Path("data/room"), shots))
+    anew = {
+        split: [s.name for s in lab.capture_of("room@new").shots if s.splits == (split,)] for split in ("train", "test")
+    }
+    shown = lab.spread(lab.without_tuning([s.name for s in shots if s.splits == ("test",)]), lab.FRAMES)
+    assert anew["train"] == [f"train_{number}" for number in range(0, 12, 2)]
+    assert len(anew["test"]) == held_out
+    assert not {*anew["train"], *shown} & {*anew["test"]}
+    half = [s.name for s in lab.capture_of("room@1").shots if s.splits == ("train",)]
+    assert len(half) == 6
+    assert half == [s.name for s in lab.capture_of("room@1").shots if s.splits == ("train",)]
+    assert half != [s.name for s in lab.capture_of("room@2").shots if s.splits == ("train",)]

@@ -1,34 +1,23 @@
-"""Acceptance of poses in a scene that repeats itself.
+"""Maps of scenes that stand twice, in which no image shows which of the two it is of.
 
-    python benchmarks/repeated_scene.py MAP:DATA [MAP:DATA ...] [--frames 40]
-
-Each map is doubled: its field and its landmarks are repeated far away, turned by 0, 90 or 180 degrees about an axis of the
-world. Each copy's descriptors get noise of their own, as if each had been built from its own photos. The test frames show
-nothing that distinguishes the copies, so that no pose should be accepted, from images alone or with measured depth. With a
-start near the true pose (a tenth of the copies' distance away; only where the copy is not turned), the pose in the right copy
-should be accepted. The doubled maps have no surface.
+A map is doubled: its field and its landmarks are repeated far away. Each copy's descriptors get noise of their own, as if each had
+been built from its own photos. The doubled map has no surface. No pose should be accepted in it, from images alone or with measured
+depth, unless a start is near one copy.
 """
 
 from __future__ import annotations
 
-import math
-from collections import Counter
-from dataclasses import asdict, replace
-from typing import Any
+from dataclasses import replace
 
 import torch
-from _lab import Scene, answer, one_thread, parser, record, within, without_depth
 from torch import Generator, Tensor, nn
 
-from bidnerf import Localizer, Map
-from bidnerf.results import success_rate
+from bidnerf import Map
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import FieldValues, RadianceField, Rays, RaySamples, SceneBounds
-from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import LandmarkMap
 
-TURNS = (0.0, 90.0, 180.0)
 DESCRIPTOR_NOISE = 5.0
 """Standard deviation of the noise in each channel of a descriptor, whose values range from 0 to 255."""
 
@@ -102,58 +91,7 @@ def twice(landmarks: LandmarkMap, T_world_copy: SE3, share: float = 1.0) -> Land
     )
 
 
-def copies(bounds: SceneBounds) -> list[SE3]:
-    """Return poses for the copy of a map, so far away that neither is within the space that the other models."""
+def far_away(bounds: SceneBounds) -> SE3:
+    """Return the pose of the copy of a map, so far away that neither is within the space that the other models."""
     away = torch.tensor([4 * max(bounds.far, bounds.side), 0.0, 0.0], dtype=torch.float64)
-    found = []
-    for turn in TURNS:
-        c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
-        rotation = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
-        found.append(SE3(rotation, away))
-    return found
-
-
-def judge_answer(localizer: Localizer, view: View, near: SE3 | None) -> tuple[bool, bool, str]:
-    """Return whether the answer is accepted, whether it is right, and its outcome."""
-    try:
-        row = answer(lambda: localizer(view.frame, near, seed=0), view)
-    except InputError:
-        return False, False, "no landmarks recognised"
-    return row["converged"], within(row), row["outcome"]
-
-
-def measure(scene: Map, views: list[View]) -> dict[str, Any]:
-    """Return counts over all frames and copies, of images alone and with depth, without and with a start."""
-    counts: dict[str, Counter[str]] = {}
-    for number, T_world_copy in enumerate(copies(scene.bounds)):
-        localizer = Localizer(double(scene, T_world_copy))
-        off = torch.zeros(6, dtype=torch.float64)
-        off[0] = 0.1 * float(T_world_copy.translation.norm())
-        for view in views:
-            colour = without_depth(view)
-            modes: list[tuple[str, View, SE3 | None]] = [("RGB", colour, None)]
-            modes += [("RGB, start", colour, view.T_ref_camera.retract(off))] if number == 0 else []
-            modes += [("RGB-D", view, None)] if view.frame.has_depth else []
-            for name, given, near in modes:
-                accepted, right, outcome = judge_answer(localizer, given, near)
-                both = {"believed": accepted, "right": right, "believed and right": accepted and right}
-                counts.setdefault(name, Counter()).update({"n": 1, outcome: 1} | both)
-    return {name: dict(count) for name, count in counts.items()}
-
-
-def main() -> None:
-    given = parser(__doc__, "repeated_scene", scenes=True).parse_args()
-    one_thread()
-    scenes: dict[str, Any] = {}
-    total: dict[str, Counter[str]] = {}
-    for scene in map(Scene.open, given.scenes):
-        found = scenes[scene.folder.name] = measure(scene.map, scene.views(given.tuning_frames, given.frames))
-        print(scene.folder.name, found, flush=True)
-        for name, count in found.items():
-            total.setdefault(name, Counter()).update(count)
-    believed = {name: asdict(success_rate(count["believed"], count["n"])) for name, count in total.items()}
-    record(given.name, {"scenes": scenes, "all": {n: dict(c) for n, c in total.items()}, "believed": believed})
-
-
-if __name__ == "__main__":
-    main()
+    return SE3(torch.eye(3, dtype=torch.float64), away)
