@@ -129,8 +129,8 @@ def run_localize(
     OpenCV axes (x right, y down, z forward).
     """
     from bidnerf.results import Answers, localize, pose_format
-    from bidnerf_core.localization import landmark_cameras, matches_landmarks, require_fit
-    from bidnerf_core.maps import Localizer, MapCollection, load_map, maps_in
+    from bidnerf_core.localization import matches_landmarks, require_fit
+    from bidnerf_core.maps import Localizer, MapCollection, landmark_cameras, load_map, maps_in
 
     count = next((n for n, path in enumerate(query) if not _holds_maps(path)), len(query))
     maps, paths = [map, *query[:count]], query[count:]

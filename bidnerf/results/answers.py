@@ -32,14 +32,9 @@ from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3, LengthUnit, fit_similarity, symbol
 from bidnerf_core.installation import import_extra
 from bidnerf_core.io import write_file
-from bidnerf_core.localization import (
-    Localization,
-    SceneMap,
-    origin_of,
-    unit_of,
-)
+from bidnerf_core.localization import Localization, SceneMap
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.maps import MapCollection, Placement
+from bidnerf_core.maps import MapCollection, Placement, origin_of, unit_of
 
 log = logging.getLogger("bidnerf")
 

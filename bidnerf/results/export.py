@@ -23,9 +23,8 @@ from bidnerf.results.pose_files import LandmarkMatches, PosedImage, frame_of, wr
 from bidnerf_core.captures import write_inria_cameras
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.io import output_folder, write_file
-from bidnerf_core.localization import origin_of
 from bidnerf_core.mapping import LandmarkMap
-from bidnerf_core.maps import Map, load_info, load_map
+from bidnerf_core.maps import Map, load_info, load_map, origin_of
 from bidnerf_core.registry import Plugins, interface_defects
 
 log = logging.getLogger("bidnerf")

@@ -26,8 +26,8 @@ from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import looks_like_image
-from bidnerf_core.localization import SceneMap, origin_of, record_search
-from bidnerf_core.maps import Localizer, MapCollection
+from bidnerf_core.localization import SceneMap, record_search
+from bidnerf_core.maps import Localizer, MapCollection, origin_of
 from bidnerf_core.progress import Cancel, ProgressCallback, counter, job_context
 
 log = logging.getLogger("bidnerf")

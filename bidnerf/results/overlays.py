@@ -13,8 +13,8 @@ from bidnerf_core.fields import render_picture
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import reduce_image
-from bidnerf_core.localization import Localization, SceneMap, origin_of
-from bidnerf_core.maps import Start, scene_of, start_pose
+from bidnerf_core.localization import Localization, SceneMap
+from bidnerf_core.maps import Start, origin_of, scene_of, start_pose
 
 PICTURE_SIDE = 240
 """Pixels along the longer side of pictures drawn in large numbers, since each rendered pixel takes time; also the width

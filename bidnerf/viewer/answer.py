@@ -25,10 +25,10 @@ from bidnerf_core.localization import (
     Localization,
     SceneMap,
     SearchRecord,
-    origin_of,
     same_pose,
 )
 from bidnerf_core.mapping import project
+from bidnerf_core.maps import origin_of
 from bidnerf_core.registry import PluginError
 
 OBSERVED = 320

@@ -29,13 +29,8 @@ from .posterior import Posterior as Posterior
 from .problem import Problem as Problem
 from .problem import SceneMap as SceneMap
 from .problem import extent_of as extent_of
-from .problem import landmark_cameras as landmark_cameras
-from .problem import move_map_to as move_map_to
-from .problem import origin_of as origin_of
 from .problem import rig as rig
 from .problem import start_covariance as start_covariance
-from .problem import unit_of as unit_of
-from .problem import window as window
 from .propose import search_radius as search_radius
 from .result import ADVICE as ADVICE
 from .result import Localization as Localization
@@ -65,5 +60,3 @@ from .tracking.points import Grey as Grey
 from .tracking.points import Points as Points
 from .tracking.state import TrackerState as TrackerState
 from .tracking.state import invert_correction as invert_correction
-from .tracking.state import load_tracker_state as load_tracker_state
-from .tracking.state import save_state as save_state

@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
 from bidnerf_core.depth import UNKNOWN, DepthSensorModel
-from bidnerf_core.devices import move_to, working_device
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import Observations, RadianceField, SceneBounds, device_of
 from bidnerf_core.frames import View
-from bidnerf_core.geometry import SE3, LengthUnit
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.matching import LandmarkMatcher
 from bidnerf_core.mapping import LandmarkMap, SurfaceMap
-
-_Item = TypeVar("_Item")
-_Map = TypeVar("_Map", bound="SceneMap")
 
 
 @runtime_checkable
@@ -67,35 +61,6 @@ def start_covariance(extent: float) -> Float[Tensor, "6 6"]:
     return torch.tensor([0.03 * extent] * 3 + [0.1] * 3, dtype=torch.float64).square().diag()
 
 
-def unit_of(scene: SceneMap) -> LengthUnit:
-    """Return the unit of a map's lengths; "units" for maps that do not state a unit, such as other projects' fields."""
-    return getattr(scene, "unit", "units")
-
-
-def origin_of(scene: object) -> Float[Tensor, "3"]:
-    """Return the origin of a map's own coordinates in its world frame (float64), see ``Map.origin``; 0 for maps that state no origin."""
-    return torch.tensor(getattr(scene, "origin", (0.0, 0.0, 0.0)), dtype=torch.float64)
-
-
-def move_map_to(scene: _Map, device: torch.device | str) -> _Map:
-    """Return a map with field, surface and landmarks on ``device``; the given map is not modified.
-
-    Raises ``InputError`` for an unavailable device, and if the field cannot be moved.
-    """
-    field = scene.field
-    if not isinstance(field, nn.Module):
-        raise InputError(
-            f"the map's field is a {type(field).__name__}", where=f"device {device}", expected="an nn.Module"
-        )
-    parts = {"field": field, "surface": scene.surface, "landmarks": scene.landmarks}
-    there = move_to(parts, working_device(device))
-    if there is parts:
-        return scene
-    found = copy.copy(scene)
-    vars(found).update(there)  # although the map may be a frozen dataclass
-    return found
-
-
 @dataclass(frozen=True, eq=False)
 class Problem:
     """K images with known relative poses in a map; the unknown is the pose of the last image's camera.
@@ -135,11 +100,6 @@ class Problem:
         return replace(self, views=views, depth_rays=None)
 
 
-def landmark_cameras(scene: SceneMap) -> tuple[Intrinsics, ...]:
-    """Return the cameras of the images from which a map's landmarks were built; photos without a focal length may be from them as well."""
-    return () if scene.landmarks is None else scene.landmarks.cameras
-
-
 def rig(
     scene: SceneMap,
     views: Sequence[View],
@@ -170,16 +130,3 @@ def rig(
         scene.colour_noise,
         UNKNOWN,
     )
-
-
-def window(sequence: Sequence[_Item], last: int, size: int, stride: int = 1) -> tuple[_Item, ...]:
-    """Return ``size`` items up to item ``last``, ``stride`` apart; fewer at the beginning of the sequence.
-
-    Views in temporal order give the paper's moving window. Raises ``InputError`` if there is no item ``last``, or for a size or stride
-    below 1.
-    """
-    if size < 1 or stride < 1:
-        raise InputError(f"the window has size {size} and stride {stride}", expected="1 or more for both")
-    if not 0 <= last < len(sequence):
-        raise InputError(f"the window ends at item {last} of {len(sequence)}, which does not exist")
-    return tuple(sequence[i] for i in range(last, -1, -stride)[:size][::-1])

@@ -27,6 +27,10 @@ from .localizer import scene_of as scene_of
 from .localizer import start_pose as start_pose
 from .map import Map as Map
 from .map import load_map as load_map
+from .scene import landmark_cameras as landmark_cameras
+from .scene import move_map_to as move_map_to
+from .scene import origin_of as origin_of
+from .scene import unit_of as unit_of
 from .store import Checkpoints as Checkpoints
 from .store import build_frozen_field as build_frozen_field
 from .store import map_folder as map_folder
@@ -36,6 +40,8 @@ from .summary import MapSummary as MapSummary
 from .summary import RenderingScores as RenderingScores
 from .summary import rendering_scores as rendering_scores
 from .tracker import Tracker as Tracker
+from .tracker_files import load_tracker_state as load_tracker_state
+from .tracker_files import save_state as save_state
 from .training import MapOptions as MapOptions
 from .training import OtherSettings as OtherSettings
 from .training import TrainOptions as TrainOptions

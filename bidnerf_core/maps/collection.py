@@ -18,18 +18,12 @@ from bidnerf_core.datasets import unique_names
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import (
-    USUAL_METHOD,
-    Localization,
-    Outcome,
-    localize_by_landmarks,
-    origin_of,
-    unit_of,
-)
+from bidnerf_core.localization import USUAL_METHOD, Localization, Outcome, localize_by_landmarks
 from bidnerf_core.mapping import LandmarkMap, Vocabulary, detect, find_features, pool_views
 from bidnerf_core.maps.description import DESCRIPTION, cameras_of, load_info
 from bidnerf_core.maps.localizer import Localizer
 from bidnerf_core.maps.map import Map, load_map
+from bidnerf_core.maps.scene import origin_of, unit_of
 from bidnerf_core.maps.store import read_part
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context, log
 

@@ -32,7 +32,7 @@ from bidnerf_core.fields import NoField, device_of, render_image, trained_field
 from bidnerf_core.frames import Frame, SeenLandmarks, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import from_plain, lock, to_plain
-from bidnerf_core.localization import Outcome, landmark_cameras
+from bidnerf_core.localization import Outcome
 from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
     BakeConfig,
@@ -44,6 +44,7 @@ from bidnerf_core.mapping import (
 from bidnerf_core.maps.description import load_info, longest_side
 from bidnerf_core.maps.localizer import Localizer
 from bidnerf_core.maps.map import USUAL_BAKE, Map, load_map
+from bidnerf_core.maps.scene import landmark_cameras
 from bidnerf_core.maps.store import with_tracks_in
 from bidnerf_core.maps.training import TrainOptions, train_field
 from bidnerf_core.maps.views import ViewSource, views_again

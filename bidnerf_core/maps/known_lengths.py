@@ -20,8 +20,8 @@ from bidnerf_core.fields import (
 )
 from bidnerf_core.geometry import SE3, fit_similarity, spread
 from bidnerf_core.io import IMAGE_SUFFIXES
-from bidnerf_core.localization import origin_of
 from bidnerf_core.maps.map import Map
+from bidnerf_core.maps.scene import origin_of
 
 Position = Sequence[float] | Float[Tensor, "3"]
 """Three coordinates (x, y, z)."""

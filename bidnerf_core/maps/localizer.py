@@ -38,15 +38,12 @@ from bidnerf_core.localization import (
     SceneMap,
     Verdict,
     find_method,
-    landmark_cameras,
-    move_map_to,
-    origin_of,
     require_fit,
     rig,
     settings_of,
-    unit_of,
 )
 from bidnerf_core.maps.map import load_map
+from bidnerf_core.maps.scene import landmark_cameras, move_map_to, origin_of, unit_of
 from bidnerf_core.progress import counter, current_job, job_context
 
 NO_DISTANCES = "the map's photos are from one place and show no distances"

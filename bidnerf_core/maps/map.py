@@ -41,7 +41,6 @@ from bidnerf_core.fields import (
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import lock
-from bidnerf_core.localization import move_map_to, origin_of
 from bidnerf_core.mapping import (
     BakeConfig,
     HeldOutTrial,
@@ -56,6 +55,7 @@ from bidnerf_core.mapping import (
     update_scatter,
 )
 from bidnerf_core.maps.description import Anchor, LandmarkSource, MapInfo, cameras_of, load_info
+from bidnerf_core.maps.scene import move_map_to, origin_of
 from bidnerf_core.maps.store import (
     build_frozen_field,
     content_digest,

@@ -30,18 +30,16 @@ from bidnerf_core.localization import (
     Verdict,
     extent_of,
     invert_correction,
-    load_tracker_state,
     localize_by_landmarks,
-    origin_of,
-    save_state,
     search_radius,
     shows_shape,
     start_covariance,
-    unit_of,
     within_limits,
 )
 from bidnerf_core.mapping import grey_image, limit_features
 from bidnerf_core.maps.localizer import NO_DISTANCES, Localizer, Start, start_pose
+from bidnerf_core.maps.scene import origin_of, unit_of
+from bidnerf_core.maps.tracker_files import load_tracker_state, save_state
 
 
 class Tracker:

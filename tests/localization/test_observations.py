@@ -1,4 +1,4 @@
-"""Depth that no pixel measured: a lidar's, or a few points; and windows of a sequence."""
+"""Depth that no pixel measured: a lidar's, or a few points."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import torch
 from bidnerf_core.fields import Observations
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import window
 from blob_images import CAMERA, FRAME, T_CAMERA_LIDAR, lidar, scan
 from refusals import refused
 from tiny import depth_rays_of
@@ -57,19 +56,3 @@ def test_nothing_measured_is_told() -> None:
     for points in (torch.zeros(3, 3), torch.full((2, 3), torch.nan), torch.zeros(0, 3)):
         with refused(where="depth rays", found="nothing was measured", expected="one finite point in front"):
             Observations.from_points(points, SE3.identity())
-
-
-def test_a_window_is_the_last_items() -> None:
-    items = list("abcdefgh")
-    assert window(items, 4, 3) == ("c", "d", "e")
-    assert window(items, 7, 3, stride=2) == ("d", "f", "h")
-    assert window(items, 1, 3) == ("a", "b")
-    assert window(items, 0, 1) == ("a",)
-    for wrong, found in (
-        ((8, 1), "at item 8 of 8"),
-        ((-1, 1), "at item -1 of 8"),
-        ((0, 0), "size 0 and stride 1"),
-    ):
-        with refused(found=found):
-            window(items, *wrong)
-    assert len(window(items, 7, 100)) == 8

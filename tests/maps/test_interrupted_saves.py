@@ -28,8 +28,8 @@ from bidnerf_core.io import is_temporary, write_file
 
 # Inside: each writer is called by itself and stopped at each of its writes
 from bidnerf_core.localization.tracking.motion import Clock
-from bidnerf_core.localization.tracking.state import TrackerState, save_state
-from bidnerf_core.maps import load_info, load_map, write_parts
+from bidnerf_core.localization.tracking.state import TrackerState
+from bidnerf_core.maps import load_info, load_map, save_state, write_parts
 from interruptions import FULL, Stopped, outcomes
 from test_storage import CAMERAS, PARTS, assert_holds, info, names, plain, save_part, state
 from trial_results import trial_result
