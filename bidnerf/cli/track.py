@@ -23,7 +23,7 @@ from bidnerf.cli.output import check_output, print_json, print_table, say
 from bidnerf.cli.parser import Group, Option, SettingsGroup, Without
 from bidnerf.cli.running import display_progress
 from bidnerf.cli.signals import defer_interruptions
-from bidnerf_core import localization
+from bidnerf_core import maps
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.installation import import_extra
 from bidnerf_core.registry import USUAL_METHOD
@@ -64,7 +64,7 @@ class TrackingOptions:
         SettingsGroup(
             "settings of the tracker",
             "How poses are predicted, corrected and accepted from frame to frame.",
-            lambda *_: localization.TrackerConfig(),
+            lambda *_: maps.TrackerConfig(),
         ),
     ] = None
 

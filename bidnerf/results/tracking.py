@@ -11,8 +11,8 @@ from bidnerf.results.answers import Answer, Answers
 from bidnerf_core.datasets import BreaksOff, Capture, open_sequence
 from bidnerf_core.errors import InputError, InputWarning, amount
 from bidnerf_core.frames import Frame
-from bidnerf_core.localization import SceneMap, TrackerConfig
-from bidnerf_core.maps import Localizer, Tracker, landmark_cameras
+from bidnerf_core.localization import SceneMap
+from bidnerf_core.maps import Localizer, Tracker, TrackerConfig, landmark_cameras
 from bidnerf_core.progress import Cancel, ProgressCallback, counter, job_context
 
 log = logging.getLogger("bidnerf")

@@ -43,7 +43,6 @@ from .search import states_at as states_at
 from .settings import AutoConfig as AutoConfig
 from .settings import ColourSettings as ColourSettings
 from .settings import DepthLossSettings as DepthLossSettings
-from .settings import TrackerConfig as TrackerConfig
 from .settings import rendered_depth_scale as rendered_depth_scale
 from .terms.images import Images as Images
 from .terms.images import surface_renderer as surface_renderer

@@ -25,6 +25,7 @@ from bidnerf_core.localization.methods import METHODS, Method
 from bidnerf_core.localization.posterior import mass_within
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict, current_record
+from bidnerf_core.localization.search import without_pose
 from bidnerf_core.localization.settings import AutoConfig
 from bidnerf_core.mapping import true_intrinsics
 
@@ -46,11 +47,10 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
         found.converged or found.outcome in (Outcome.MISCALIBRATED, Outcome.MIRRORED, Outcome.AMBIGUOUS)
     ):
         found = _on_surface(problem, config, seed, loop, found, began)
-    is_blank = found.outcome is Outcome.UNDETERMINED
-    if problem.matcher is None and problem.surface is not None and not (found.converged or is_blank):
+    explained = found.converged or found.outcome is Outcome.UNDETERMINED
+    if problem.matcher is None and problem.surface is not None and not explained:
         found = replace(found, reason=f"{found.reason}; the map has no landmarks ('bidnerf bake' makes them)")
-    found = replace(found, seconds=time.perf_counter() - began)
-    return within_limits(found, config)
+    return within_limits(replace(found, seconds=time.perf_counter() - began), config)
 
 
 def localize_by_landmarks(problem: Problem, rays: int, seed: int) -> Localization:
@@ -144,8 +144,7 @@ def unrecognized(problem: Problem) -> Localization:
     """Return the rejected answer for images in which no landmarks were recognised."""
     causes = "the image may show another place, or be too dark, too blurred or taken from too far away"
     why = Verdict(Outcome.TOO_FEW_MATCHES, f"too few landmarks were recognised: {causes}")
-    path, none = (problem.start or SE3.identity())[None], torch.zeros(0, dtype=torch.float64)
-    return Localization.of(why, path, none, "auto", time.perf_counter(), float("nan"))
+    return without_pose(problem, why)
 
 
 def within_risk(found: Localization, risk: float | None) -> Localization:

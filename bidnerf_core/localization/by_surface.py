@@ -20,8 +20,7 @@ from bidnerf_core.localization.accept import Support, support
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search import (
-    COLOUR_SIGMA,
-    SHAPE_SIGMA,
+    SIGMA,
     SearchResult,
     Stage,
     conclude,
@@ -29,6 +28,7 @@ from bidnerf_core.localization.search import (
     halve,
     localization_by_rays,
     states_at,
+    without_pose,
 )
 from bidnerf_core.localization.settings import AutoConfig, ColourSettings, DepthLossSettings
 from bidnerf_core.localization.terms.images import Images, surface_renderer
@@ -77,7 +77,7 @@ def localize_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig,
     if config.refine_steps and supported:
         # The pose is nearly right, hence a small uncertainty of the field's surfaces.
         depth = DepthLossSettings(depth_weight=1.0)
-        rays = draw_rays(problem, ColourSettings(), depth, config.refine_rays, seed, sigma=SHAPE_SIGMA / 4)
+        rays = draw_rays(problem, ColourSettings(), depth, config.refine_rays, seed, sigma=1.25 * SIGMA)
         rays = replace(rays, noise=problem.colour_noise or rays.noise)
         steps: list[tuple[SE3, Tensor]] = []
         refined, _ = descend(best, [aligned, rays], config.refine_steps, middle, steps)
@@ -110,15 +110,13 @@ def localize_by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig
     began, problem, answers = time.perf_counter(), problem.without_depth(), list[Localization]()
     if all(is_blank(view.frame) for view in problem.views):
         why = Verdict(Outcome.UNDETERMINED, "the image has a single colour, as if the lens were covered")
-        path = (problem.start or SE3.identity())[None]
-        return Localization.of(why, path, torch.zeros(0, dtype=torch.float64), "auto", began, math.nan)
+        return without_pose(problem, why)
     for number in range(config.rounds):
         coarse = draw_rays(
-            problem, config.colour, None, config.fine_rays // 4, seed, levels(problem.field)[0], 2, COLOUR_SIGMA
+            problem, config.colour, None, config.fine_rays // 4, seed, levels(problem.field)[0], 2, SIGMA
         )
         fine, fresh = (
-            draw_rays(problem, config.colour, None, config.fine_rays, seed + more, sigma=COLOUR_SIGMA / 2)
-            for more in (1, 2)
+            draw_rays(problem, config.colour, None, config.fine_rays, seed + more, sigma=SIGMA / 2) for more in (1, 2)
         )
         later = [Stage([coarse], min(4, config.fine_steps), 2), Stage([fine], config.fine_steps, 1)]
         found, middle = by_images(problem, surface, config.hypotheses, seed + number, later)

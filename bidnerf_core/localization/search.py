@@ -5,6 +5,7 @@ A search ends with steps on rendered rays: at first few rays at the coarsest lev
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -18,7 +19,7 @@ from bidnerf_core.fields import RadianceField
 from bidnerf_core.geometry import SE3, Robust
 from bidnerf_core.localization.accept import DISPLACEMENT, Support, same_pose, support
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.localization.result import Localization, current_record
+from bidnerf_core.localization.result import Localization, Verdict, current_record
 from bidnerf_core.localization.settings import (
     ColourSettings,
     DepthLossSettings,
@@ -29,10 +30,8 @@ from bidnerf_core.localization.terms.rays import ALONE, RenderedRays
 from bidnerf_core.mapping import CostTerm, States, damped_solution, descend
 from bidnerf_core.progress import check_cancelled
 
-SHAPE_SIGMA = 0.012
-"""Uncertainty of the map's surfaces in coarse steps with depth, relative to the scene's mean side."""
-COLOUR_SIGMA = SHAPE_SIGMA / 5
-"""Uncertainty of the map's surfaces in steps by colour alone that follow a search, relative to the scene's mean side."""
+SIGMA = 0.0024
+"""Uncertainty of the map's surfaces in the first steps on rays that follow a search, relative to the scene's mean side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,3 +188,9 @@ def conclude(
     """Return the answer at the end of a search's ``path``; the path begins at the start, if there is one. ``accepted`` is the reason."""
     path = path if problem.start is None else SE3.cat([problem.start[None], path[1:]])
     return Localization.of(judged.verdict(accepted), path, losses, "auto", began, loss, covariance, judged)
+
+
+def without_pose(problem: Problem, why: Verdict) -> Localization:
+    """Return the rejected answer for images that show nothing that could be localized; its pose is the start."""
+    path, none = (problem.start or SE3.identity())[None], torch.zeros(0, dtype=torch.float64)
+    return Localization.of(why, path, none, "auto", time.perf_counter(), float("nan"))

@@ -1,4 +1,4 @@
-"""Settings of method ``auto`` and the tracker, in groups that other methods share."""
+"""Settings of method ``auto``, in groups that other methods share."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bidnerf_core.depth import DEPTH_SENSORS
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.geometry import RobustName
 from bidnerf_core.localization.accept import least_confidence
-from bidnerf_core.settings import EXPERT, Above, NotNegative, OneOf, Positive, Range, Settings
+from bidnerf_core.settings import EXPERT, NotNegative, OneOf, Positive, Range, Settings
 
 LEAST_POINTS = 50
 """Minimum number of measured depths from which the shape of the scene can be recognised."""
@@ -83,11 +83,3 @@ class AutoConfig(Settings):
         super().__post_init__()
         if self.risk is not None:
             least_confidence(self.risk)
-
-
-@dataclass(frozen=True)
-class TrackerConfig(Settings):
-    """Settings of a tracker."""
-
-    # interval between frames without time stamps, seconds
-    frame_seconds: Annotated[float, Above(0.0, 1e4)] = 1 / 30

@@ -40,6 +40,7 @@ from .summary import MapSummary as MapSummary
 from .summary import RenderingScores as RenderingScores
 from .summary import rendering_scores as rendering_scores
 from .tracker import Tracker as Tracker
+from .tracker import TrackerConfig as TrackerConfig
 from .tracker_files import load_tracker_state as load_tracker_state
 from .tracker_files import save_state as save_state
 from .training import MapOptions as MapOptions

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import time as clocks
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 
@@ -25,7 +25,6 @@ from bidnerf_core.localization import (
     Points,
     PoseEstimate,
     SceneMap,
-    TrackerConfig,
     TrackerState,
     Verdict,
     extent_of,
@@ -40,6 +39,15 @@ from bidnerf_core.mapping import grey_image, limit_features
 from bidnerf_core.maps.localizer import NO_DISTANCES, Localizer, Start, start_pose
 from bidnerf_core.maps.scene import origin_of, unit_of
 from bidnerf_core.maps.tracker_files import load_tracker_state, save_state
+from bidnerf_core.settings import Above, Settings
+
+
+@dataclass(frozen=True)
+class TrackerConfig(Settings):
+    """Settings of a tracker."""
+
+    # interval between frames without time stamps, seconds
+    frame_seconds: Annotated[float, Above(0.0, 1e4)] = 1 / 30
 
 
 class Tracker:

@@ -25,13 +25,14 @@ from bidnerf.testing import textured_view as view
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import read_tensors_and_metadata
-from bidnerf_core.localization import AutoConfig, Posterior, TrackerConfig
+from bidnerf_core.localization import AutoConfig, Posterior
 from bidnerf_core.localization.tracking.motion import Clock
 
 # Inside: flow, and the parts of a state that only rare sequences fill
 from bidnerf_core.localization.tracking.points import correlate
 from bidnerf_core.localization.tracking.state import TrackerState, invert_correction
 from bidnerf_core.mapping import Landmarks, Normal, States, prior
+from bidnerf_core.maps import TrackerConfig
 from conditions import ground_landmarks, with_landmarks
 from flights import (
     FRAMES,

@@ -121,14 +121,15 @@ class Measurer:
         Landmarks tracked to this frame are used as long as there are enough; otherwise, landmarks are recognised anew around the pose
         of the tracked landmarks or around the prediction.
         """
-        measured = self._measured(frame, image, state, predicted)
+        if self.landmarks is None or image is None:
+            measured = self._by_surface(frame, image, state, predicted)
+        else:
+            measured = self._by_known(self.landmarks, frame, replace(state, age=state.age + 1), predicted)
         return measured if measured is None else replace(measured, answer=within_limits(measured.answer, self.config))
 
-    def _measured(self, frame: Frame, image: Grey | None, state: TrackerState, predicted: Motion) -> Measurement | None:
-        landmarks = self.landmarks
-        if landmarks is None or image is None:
-            return self._by_surface(frame, image, state, predicted)
-        state = replace(state, age=state.age + 1)
+    def _by_known(
+        self, landmarks: LandmarkMap, frame: Frame, state: TrackerState, predicted: Motion
+    ) -> Measurement | None:
         known, fit, tracked, usable = state.points.landmarks, None, None, False
         if len(known) >= LEAST_AGREEING:
             correlation = landmarks.correlation_of(len(known))
