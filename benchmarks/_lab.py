@@ -199,7 +199,7 @@ def modes(views: Sequence[View], wanted: Iterable[str] = ("RGB", "RGB-D")) -> di
 def errors_of(found: Localization, truth: View | None) -> Row:
     """Return an answer's errors, and the squared error that its covariance normalises; None for each that is not known."""
     names = ("translation", "rotation_deg", "normalized_error_squared")
-    if truth is None or not bool(found.T_world_camera.matrix().isfinite().all()):
+    if truth is None or not found.T_world_camera.is_finite:
         return dict.fromkeys(names)
     error, squared = pose_error(found.T_world_camera, truth.T_ref_camera), None
     if found.covariance is not None:

@@ -278,7 +278,9 @@ def answer_lines(answer: Answer, full: bool) -> list[str]:
         lines.append(
             f"  uncertainty  {position:.4f} {symbol(localization.unit)}, {math.degrees(rotation):.3f} deg (one standard deviation)"
         )
-    if full:
+    if full and not localization.T_world_camera.is_finite:
+        lines.append("  no pose, since nothing was recognised")
+    elif full:
         lengths = "metres" if localization.unit == "metres" else "units of the map"
         lines.append(f"  T_world_camera ({world}{OPENCV_AXES}; lengths in {lengths})")
         matrix = localization.T_world_camera.matrix().tolist()

@@ -74,18 +74,13 @@ class Answer:
     @property
     def accepted(self) -> bool:
         """Whether the localization converged to a finite pose."""
-        return self.localization.converged and self.is_finite
-
-    @property
-    def is_finite(self) -> bool:
-        """Whether the pose consists of finite numbers."""
-        return bool(self.localization.T_world_camera.matrix().isfinite().all())
+        return self.localization.converged and self.localization.T_world_camera.is_finite
 
     @property
     def error(self) -> PoseError | None:
-        """The error of the pose, or None if the true pose is unknown."""
-        localization = self.localization
-        return None if self.truth is None else pose_error(localization.T_world_camera, self.truth, localization.unit)
+        """The error of the pose, or None if it or the true pose is unknown."""
+        T = self.localization.T_world_camera
+        return pose_error(T, self.truth, self.localization.unit) if self.truth is not None and T.is_finite else None
 
 
 @dataclass(frozen=True)
@@ -301,7 +296,10 @@ class Answers:
         ``up`` is the up direction of the scene (``Map.up``), by default estimated from the surface and the
         cameras. Raises ``InputError`` without matplotlib or without any finite pose.
         """
-        drawn, origin = [answer for answer in self.answers if answer.is_finite], origin_of(self.scene)
+        drawn, origin = (
+            [answer for answer in self.answers if answer.localization.T_world_camera.is_finite],
+            origin_of(self.scene),
+        )
         if not drawn:
             raise InputError("not drawn, since no frame was tracked", where=file)
         covariances = [answer.localization.covariance for answer in drawn]

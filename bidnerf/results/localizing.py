@@ -26,7 +26,7 @@ from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import looks_like_image
-from bidnerf_core.localization import SceneMap, record_search
+from bidnerf_core.localization import Outcome, SceneMap, record_search
 from bidnerf_core.maps import Localizer, MapCollection, origin_of
 from bidnerf_core.progress import Cancel, ProgressCallback, counter, job_context
 
@@ -86,7 +86,8 @@ def localize(
                 answer = Answer.of(
                     frame, number, localization, truth=truth, file=query.file, placement=placement, matches=matches
                 )
-                if placement is None and not answer.is_finite:
+                no_pose = not localization.T_world_camera.is_finite  # a refused answer may be without one
+                if no_pose and localization.outcome in (Outcome.CONVERGED, Outcome.DIVERGED):
                     raise InputError(
                         f"{localization.method} diverged to a pose that is not finite; is the map valid?", where=name
                     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
@@ -40,7 +41,9 @@ def overlay(
     if isinstance(pose, Localization):
         frame, pose = pose.frame_as_taken(frame), pose.T_world_camera
     painter = Painter(scene, frame, 640)
-    rows = [painter.row(painter.observed, "observed", start_pose(pose, "pose"), "rendered at the pose found")]
+    T = start_pose(pose, "pose")
+    caption = "rendered at the pose found" if T.is_finite else "no pose was found"
+    rows = [painter.row(painter.observed, "observed", T, caption)]
     if start is not None:
         rows.append(painter.row(painter.observed, "observed", start_pose(start), "rendered at the start"))
     return np.concatenate(rows, axis=0)
@@ -57,7 +60,9 @@ class Painter:
         self.observed: Float[Tensor, "h w 3"] = frame.rgb if scale >= 1 else reduce_image(frame.rgb, *size)
 
     def render(self, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
-        """Render the map with the photo's camera at a pose."""
+        """Render the map with the photo's camera at a pose; the picture is white if the pose is unknown."""
+        if not T_world_camera.is_finite:
+            return torch.ones_like(self.observed)
         T = T_world_camera.translated(-origin_of(self._map))
         return render_picture(self._map.field, self._camera, T, self._map.bounds).rgb
 

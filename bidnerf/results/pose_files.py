@@ -66,7 +66,7 @@ class PosedImage:
     def pose(self) -> SE3:
         """T_world_camera in float64, on the CPU. Raises ``InputError`` if it is not finite."""
         pose = self.T_world_camera.to("cpu", torch.float64)
-        if not bool(pose.matrix().isfinite().all()):
+        if not pose.is_finite:
             raise InputError(f"the pose of {self.name} is not finite", expected="to leave it out, or a .json file")
         return pose
 

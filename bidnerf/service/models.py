@@ -190,7 +190,9 @@ class LocalizationBody(BaseModel):
     model_config = ConfigDict(title="Localization", json_schema_extra=_drop_null_defaults)
 
     frame: str
-    T_world_camera: Annotated[list[Row4], Field(min_length=4, max_length=4, description="camera to world")]
+    T_world_camera: Annotated[list[Row4], Field(min_length=4, max_length=4)] | None = Field(
+        description="camera to world, or null in a refused answer that found no pose"
+    )
     converged: bool = Field(description="whether the pose can be trusted")
     outcome: str
     reason: str

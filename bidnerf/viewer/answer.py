@@ -95,12 +95,11 @@ def answer_json(
     origin, unit = -origin_of(scene), localization.unit
     localization = localization.translated(origin)
     T = localization.T_world_camera.to("cpu", torch.float64)
-    finite = bool(T.matrix().isfinite().all())
     positions = localization.poses.translation.detach().cpu().double()
     answer = NO_ANSWER | {
         "name": name,
         "outcome": str(localization.outcome),
-        "accepted": localization.converged and finite,
+        "accepted": localization.converged and T.is_finite,
         "reason": localization.reason,
         "method": localization.method,
         "seconds": localization.seconds,
@@ -119,7 +118,7 @@ def answer_json(
     if truth is not None:
         truth = truth.translated(origin)
         answer["truth"] = matrix_rows(truth)
-        if finite:
+        if T.is_finite:
             error = pose_error(T, truth, unit)
             answer["error"] = float(error.translation), float(error.rotation_deg)
     if frame is not None:
@@ -135,7 +134,7 @@ def answer_json(
             "shape": frustum(frame.intrinsics),
             "observed": jpeg_json(reduce_image(frame.rgb, small.width, small.height)),
         }
-    if finite:
+    if T.is_finite:
         answer |= {"pose": matrix_rows(T), "ellipsoid": ellipsoid(T, localization.covariance)}
         if record is not None:
             answer["runner_up"] = _runner_up(scene, localization, record)
@@ -227,9 +226,9 @@ def _steps(localization: Localization, record: SearchRecord | None) -> tuple[Jso
         count = min(len(localization.losses), len(localization.poses.translation) - 1)
         for number in range(0, count, max(1, math.ceil(count / MOST_STEPS))):
             T, loss = localization.poses[number : number + 1], float(localization.losses[number])
-            if bool(T.matrix().isfinite().all()):
+            if T.is_finite:
                 shown.append(_step(f"step {number} of {count}", T, [loss], 1, loss))
-    if not bool(last.matrix().isfinite().all()):
+    if not last.is_finite:
         return tuple(shown)
     answer = last_answer(record)
     if answer is not None and len(answer.modes) > 1:  # the pose and its rivals

@@ -37,6 +37,16 @@ class SE3:
         return SE3(torch.eye(3, dtype=dtype, device=device), torch.zeros(3, dtype=dtype, device=device))
 
     @staticmethod
+    def unknown() -> SE3:
+        """Return a transform of which nothing is known: all its numbers are NaN."""
+        return SE3(*(torch.full(shape, math.nan, dtype=torch.float64) for shape in ((3, 3), (3,))))
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether all numbers are finite."""
+        return bool(self.rotation.isfinite().all() and self.translation.isfinite().all())
+
+    @staticmethod
     def from_matrix(matrix: Float[Tensor, "*b 4 4"]) -> SE3:
         """Convert homogeneous matrices to transforms; whether they are rigid is not checked (see ``is_rigid``).
 

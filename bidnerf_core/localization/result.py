@@ -77,7 +77,7 @@ class Verdict:
 class Localization:
     """The pose found for the last view's camera, with its uncertainty and acceptance."""
 
-    T_world_camera: SE3
+    T_world_camera: SE3  # NaN in a refused answer that found no pose
     outcome: Outcome  # determined without ground truth
     reason: str  # the outcome in a sentence
     steps: int
@@ -110,7 +110,9 @@ class Localization:
         """Return a one-line description, without the steps and the covariance."""
         x, y, z = self.T_world_camera.translation.tolist()
         sure = "" if self.confidence is None else f", confidence {self.confidence:.3g}"
-        where = f"at ({x:.4g}, {y:.4g}, {z:.4g}) {symbol(self.unit)}"
+        where = (
+            f"at ({x:.4g}, {y:.4g}, {z:.4g}) {symbol(self.unit)}" if self.T_world_camera.is_finite else "without a pose"
+        )
         return f"<Localization {self.outcome.value} {where}{sure}: {self.reason}>"
 
     @staticmethod

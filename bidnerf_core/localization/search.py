@@ -157,7 +157,7 @@ def localization_by_rays(
     step = -damped_solution(normal, torch.zeros_like(normal.cost))[0, :6]
     shift = SE3.exp(step).apply(middle) - middle
     measures: dict[str, float | None] = {"plain": 0.0, "confidence": 0.25}
-    if bool(T.matrix().isfinite().all()):
+    if T.is_finite:
         costs = fresh.plain_costs()
         measures = support(lambda T: fresh.costs(states_at(T)), T, middle, costs, found.rivals.T)
     agreement, by_colour = float(here.agreement()[0]), fresh.depth_loss is None and problem.colour_noise
@@ -191,6 +191,6 @@ def conclude(
 
 
 def without_pose(problem: Problem, why: Verdict) -> Localization:
-    """Return the rejected answer for images that show nothing that could be localized; its pose is the start."""
-    path, none = (problem.start or SE3.identity())[None], torch.zeros(0, dtype=torch.float64)
+    """Return the rejected answer for images that show nothing that could be localized; its pose is the start, or unknown without one."""
+    path, none = (problem.start or SE3.unknown())[None], torch.zeros(0, dtype=torch.float64)
     return Localization.of(why, path, none, "auto", time.perf_counter(), float("nan"))

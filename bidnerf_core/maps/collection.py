@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from bidnerf_core.datasets import unique_names
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import USUAL_METHOD, Localization, Outcome, localize_by_landmarks
+from bidnerf_core.localization import USUAL_METHOD, Localization, Outcome, Verdict, localize_by_landmarks
 from bidnerf_core.mapping import LandmarkMap, Vocabulary, detect, find_features, pool_views
 from bidnerf_core.maps.description import DESCRIPTION, cameras_of, load_info
 from bidnerf_core.maps.localizer import Localizer
@@ -176,18 +177,8 @@ class MapCollection:
             rays = getattr(localizer.config, "fused_rays", 0)
             found = localize_by_landmarks(localizer.problem(frame), rays, seed)
         except InputError as error:  # such as a map without a surface
-            T = SE3.identity()  # of no meaning
-            return Localization(
-                T,
-                Outcome.TOO_FEW_MATCHES,
-                str(error),
-                0,
-                0.0,
-                math.nan,
-                self.method,
-                SE3.stack([T]),
-                torch.zeros(0, dtype=torch.float64),
-            )
+            why, losses = Verdict(Outcome.TOO_FEW_MATCHES, str(error)), torch.zeros(0, dtype=torch.float64)
+            return Localization.of(why, SE3.unknown()[None], losses, self.method, time.perf_counter(), math.nan)
         return replace(found, unit=unit_of(localizer.scene)).translated(origin_of(localizer.scene))
 
     def _index(self) -> dict[str, tuple[str, int]]:

@@ -307,10 +307,10 @@ def picture_html(
 ) -> str:
     """Return an HTML element with a small photo, the map rendered at the estimated pose, and a blend of both.
 
-    Returns "" if the map no longer exists, or cannot be rendered from the pose.
+    Returns "" if the map no longer exists or cannot be rendered from the pose, or if there is no pose.
     """
     scene = scene_reference()
-    if scene is None:
+    if scene is None or not found.T_world_camera.is_finite:
         return ""
     camera = (found.intrinsics or stated).resized(photo.shape[1], photo.shape[0])
     try:

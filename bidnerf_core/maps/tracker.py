@@ -100,7 +100,7 @@ class Tracker:
 
         ``time`` (seconds, from any origin) is its time stamp; without one, the last interval is assumed. If the pose is
         rejected, the answer has an ``outcome`` other than ``CONVERGED``, and its pose is the best estimate with a corresponding
-        covariance. Raises ``InputError`` for a non-finite time, and if the map does not allow the first frame to be found
+        covariance, or NaN before the sequence has been recognised. Raises ``InputError`` for a non-finite time, and if the map does not allow the first frame to be found
         without a start.
         """
         began = clocks.perf_counter()
@@ -165,9 +165,8 @@ class Tracker:
         if state.motion is None or predicted is None:
             if found is None:
                 why = Verdict(Outcome.TOO_FEW_MATCHES, "the beginning of the sequence has not been recognised yet")
-                unknown = torch.tensor([self._extent] * 3 + [math.pi] * 3, dtype=torch.float64).square().diag()
-                somewhere = self._at(frame, self._start or SE3.identity(), unknown)
-                found = Measurement.of(somewhere, somewhere, why, 1.0, state).answer
+                path, losses = (self._start or SE3.unknown())[None], torch.zeros(0, dtype=torch.float64)
+                found = Localization.of(why, path, losses, "track", clocks.perf_counter(), math.nan)
             return found, state
         # With each lost frame, 0.6 of the velocity is kept.
         state = replace(

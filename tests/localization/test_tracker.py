@@ -364,6 +364,7 @@ def test_shape_alone_neither_begins_a_sequence_nor_corrects_a_vague_prediction()
     tracker = Tracker(localizer())
     answers = tracked([(t, depth_only(f), T) for t, f, T in flight()[:2]], tracker)
     assert [answer.outcome for answer in answers] == [Outcome.TOO_FEW_MATCHES] * 2
+    assert not answers[1].T_world_camera.is_finite  # rather than the identity, which is a pose
     assert_right(tracked(flight()[2:3], tracker), flight()[2:3])
     late = tracker(depth_only(flight()[3][1]), flight()[3][0] + 5.0)
     assert late.outcome is Outcome.UNDETERMINED

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 import bidnerf as bn
 import drawn
 from bidnerf import SE3, Frame, Localization, Outcome
+from bidnerf.cli.localize import answer_lines
 from bidnerf.results import (
     Answer,
     Answers,
@@ -111,6 +112,22 @@ def test_an_overlay_shows_photo_rendering_and_both(folder: Path) -> None:
         rgb=torch.zeros((10, 800, 3)), depth=None, intrinsics=bn.Intrinsics(400.0, 400.0, 400.0, 5.0, 800, 10)
     )
     assert overlay(scene(), wide, T).shape[1] // 3 // 10 == 64  # a tile has 640 pixels of the photo
+
+
+def test_an_answer_that_found_nothing_has_no_pose() -> None:
+    black = flight()[0][1].replace(rgb=torch.zeros((96, 128, 3)), depth=None)
+    answers = bn.localize(scene(), black)
+    answer, found = answers.answers[0], answers.answers[0].localization
+    assert (found.converged, found.T_world_camera.is_finite, answer.error) == (False, False, None)
+    assert "without a pose" in repr(found)
+    assert "<img" not in found._repr_html_()
+    plain = answers.plain(answer)
+    assert (plain["T_world_camera"], plain["covariance"]) == (None, None)
+    lines = answer_lines(answer, full=True)
+    assert lines[0].startswith("0000: refused: ")
+    assert lines[1:] == ["  no pose, since nothing was recognised"]
+    third = np.split(overlay(scene(), black, found), 3, axis=1)[1]
+    assert (third[30:-10, 10:-10] == 255).all()
 
 
 @pytest.mark.usefixtures("unchecked")
