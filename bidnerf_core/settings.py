@@ -26,6 +26,8 @@ S = TypeVar("S")
 
 LARGEST_SEED = 2**31 - 1
 """Largest seed that commands and requests accept; every language represents it exactly. Python functions accept larger ones."""
+WIDEST_HFOV = 170.0
+"""Largest horizontal field of view (degrees): beyond it, the inner half of the angles fills less than 1/12 of a pinhole image."""
 
 
 class Allowed(Container[object]):

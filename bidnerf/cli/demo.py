@@ -62,7 +62,9 @@ def run_demo(
         unseen = views(scene, camera, orbit(radius, frames, elevation=(15.0, 50.0), seed=seed + 1))
         write_transforms(out / "data", {"train": seen, "test": unseen}, background)
         options = TrainOptions(DatasetOptions(background=background), overwrite=True)
-        with report_time(f"trained on {len(seen)} images of the closed-form scene, and baked"), interruptible_work():
+        stopped = f"stopped; the demo cannot be continued, 'bidnerf demo --out {out} --overwrite' starts again"
+        what = f"trained on {len(seen)} images of the closed-form scene, and baked"
+        with report_time(what), interruptible_work(kept=stopped):
             stored = train(out / "data", backend, out / "map", config, options=options)
         say(f"localizing {frames} unseen frames by auto without a start, and by bid from a start nearby")
         auto, bid = Localizer(stored), Localizer(stored, "bid", settings_of("bid", DESCENT))

@@ -200,7 +200,7 @@ class Run:
         """Print an answer or a failure, and draw an answer if a folder for drawings was given."""
         from bidnerf.results import Failure, overlay
         from bidnerf_core.io import png_bytes, write_file
-        from bidnerf_core.maps import MapCollection
+        from bidnerf_core.maps import Map
 
         if isinstance(answer, Failure):
             say(f"{answer.name}: {answer.reason}")
@@ -213,8 +213,7 @@ class Run:
                 show(line)
         if self.output.draw is not None:
             scene = self.answers.scene
-            assert scene is not None
-            assert not isinstance(scene, MapCollection)
+            assert isinstance(scene, Map)
             picture = overlay(scene, query.frame, answer.localization, self.start(query))
             write_file(self.output.picture(query.name), png_bytes(picture))
 

@@ -272,7 +272,7 @@ def run_bake(
     require_inputs(data)
     # The baked parts may be damaged, so they are not loaded here.
     scene = load_map(map, device, baked=False)
-    with interruptible_work():
+    with interruptible_work(kept=f"stopped; {map} keeps the parts that were finished"):
         scene = scene.bake(
             data, config, images=images, rendered_landmarks=rendered_landmarks, features=landmark_features
         )
@@ -321,7 +321,7 @@ def run_extend(
     options = replace(images, background=info.bounds.background)
     opened: dict[Path, Path | Capture] = {path: options.open(path) for path in datasets}
     known = None if data is None else opened.get(data, data)
-    with interruptible_work():
+    with interruptible_work(kept=f"stopped; {map} is unchanged"):
         scene = extend(map, opened.get(new, new), known, split=images.split, steps=steps, config=config, device=device)
     added, total = len(scene.info.cameras) - len(info.cameras), len(scene.info.cameras)
     text = f"{map}: {amount(added, 'photo')} added, {amount(total, 'image')} in all"
@@ -397,6 +397,6 @@ def run_import(
     options = ImportOptions(
         images, target.landmark_features, target.device, target.overwrite, importer, world.scale, pose
     )
-    with interruptible_work():
+    with interruptible_work(kept=f"stopped; {out} was not written"):
         scene = import_map(file, out, config, photos=photos, bake=not target.no_bake, options=options)
     print_result(scene.describe().plain(), (), target.json)

@@ -15,7 +15,7 @@ from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.installation import import_extra
 from bidnerf_core.registry import USUAL_FEATURES, USUAL_METHOD, Plugins
-from bidnerf_core.settings import EXPERT, LARGEST_SEED, Above, OneOf, WholeNumbers
+from bidnerf_core.settings import EXPERT, LARGEST_SEED, WIDEST_HFOV, Above, OneOf, WholeNumbers
 
 if TYPE_CHECKING:
     from bidnerf_core.camera import CameraSource, Intrinsics
@@ -146,6 +146,8 @@ def refuse(options: Mapping[str, object], reason: str, expected: str | None = No
 
 def require_device(device: str) -> None:
     """Raise ``UsageError`` if a device does not work here."""
+    if device == "cpu":  # which needs no torch to be known
+        return
     from bidnerf_core.devices import working_device
 
     with wrong_usage():
@@ -173,9 +175,9 @@ class CameraOptions:
     """The camera of images whose format stores none."""
 
     focal: Annotated[float | None, Above(0.0), Option("PX", "focal length in pixels of the image file")] = None
-    hfov: Annotated[float | None, Above(0.0, 179.0), Option("DEG", "horizontal field of view of the upright image")] = (
-        None
-    )
+    hfov: Annotated[
+        float | None, Above(0.0, WIDEST_HFOV), Option("DEG", "horizontal field of view of the upright image")
+    ] = None
 
     def __post_init__(self) -> None:
         require_one({"--focal": self.focal, "--hfov": self.hfov})
@@ -251,6 +253,8 @@ class QueryOptions:
             return lambda _, background: DatasetFrames(
                 replace(images, background=background).open(paths[0]), images.split, self.frame, self.window, self.rig
             )
+        split = None if images.split == TEST_IMAGES.split else images.split
+        refuse({"--split": split}, f"is for a dataset, but {paths[0]} is none; leave it out")
         if self.window > 1:
             raise UsageError(f"--window {self.window} needs known relative poses", expected="a dataset")
         files = photo_files(paths, self.depth)

@@ -78,7 +78,7 @@ def check_output(out: Path, inputs: Iterable[Path | str | None], overwrite: bool
     """
     # os.path functions return False for a name that is too long, which is reported when it is written.
     if os.path.isdir(out) or not os.path.isdir(out.parent):
-        found = "is a folder" if os.path.isdir(out) else f"no folder {out.parent}"
+        found = "is a folder" if os.path.isdir(out) else f"its folder {out.parent} does not exist"
         raise InputError(found, where=out, expected="a file in an existing folder")
     require_outside_maps(out.parent, out)
     _require_writable(out.parent, out)

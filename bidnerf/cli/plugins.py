@@ -7,7 +7,7 @@ from importlib.metadata import metadata, version
 from typing import Annotated, Any
 
 from bidnerf.cli.options import Json
-from bidnerf.cli.output import print_json, print_table
+from bidnerf.cli.output import print_json, print_table, show
 from bidnerf.cli.parser import Option
 from bidnerf_core.errors import InputError
 from bidnerf_core.installation import requirements
@@ -67,8 +67,11 @@ def run_doctor(json: Json = False) -> None:
         rows = [[name, str(found[name])] for name in ("bidnerf", "python", "platform")]
         rows += [["device", device] for device in found["devices"]]
         rows += [[requirement.name, requirement.installed or "missing"] for requirement in needed]
-        rows += [[f"extra {name}", ", ".join(map(str, unmet)) or "installed"] for name, unmet in extras.items()]
-        print_table(["", ""], [*rows, *(["plugin", text] for text in found["plugins"])], wide="")
+        for name, unmet in extras.items():
+            missing = f"{', '.join(map(str, unmet))}; optional: pip install 'bidnerf[{name}]'"
+            rows.append([f"extra {name}", missing if unmet else "installed"])
+        for name, text in [*rows, *(["plugin", text] for text in plugins)]:
+            show(f"{name:<22}  {text}")  # a line each at any width of the terminal, since it is pasted into reports
     if broken:
         raise InputError(f"{broken[0]}; pip install -U bidnerf")
 

@@ -98,11 +98,12 @@ def display_progress() -> Iterator[None]:
 
 @contextlib.contextmanager
 def interruptible_work(
-    announcement: str = "stopping after this step (Ctrl-C again: at once, back to the last checkpoint)",
+    announcement: str = "stopping after this step (Ctrl-C again: at once)", kept: str | None = None
 ) -> Iterator[None]:
     """Display the progress of the work in the context, and let Ctrl-C stop it at its next check; a second Ctrl-C stops it at once.
 
-    Once the work has stopped at a check, a line states what was kept, and ``Interrupted`` is raised.
+    Once the work has stopped at a check, a line states what was ``kept`` and how to go on, by default as the library says it, and
+    ``Interrupted`` is raised.
     """
     handler = installed_handler()
     handler.works, handler.announce = True, lambda: say(announcement)
@@ -112,7 +113,7 @@ def interruptible_work(
     except Cancelled as stopped:
         if handler.waiting is None:  # something other than Ctrl-C stopped it
             raise
-        say(str(stopped))
+        say(kept or str(stopped))
         raise Interrupted(handler.waiting) from stopped
     finally:
         handler.works, handler.waiting = False, None

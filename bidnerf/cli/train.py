@@ -204,7 +204,8 @@ def run_train(
         sparse_depth.model_points,
         training.checkpoint_every,
     )
-    with report_time(f"{out}: trained and baked" if bake else f"{out}: trained"), interruptible_work():
+    announcement = "stopping after this step (Ctrl-C again: at once, back to the last checkpoint)"
+    with report_time(f"{out}: trained and baked" if bake else f"{out}: trained"), interruptible_work(announcement):
         if resumes:
             try:
                 scene = resume(out, data, bake=bake, finish=training.finish, options=options)

@@ -164,10 +164,7 @@ def run_serve(
     require_device(device)
     stated = os.environ.get(TOKEN)
     if token_file is not None:
-        try:
-            stated = read_file(token_file, "a file with a token", 4096).decode().strip()
-        except UnicodeDecodeError as error:
-            raise InputError("is not text", where=token_file, expected="a token") from error
+        stated = read_file(token_file, "a file with a token", 4096).decode(errors="replace").strip()  # checked later
         if not stated:
             raise InputError("is empty", where=token_file, expected="a token")
 

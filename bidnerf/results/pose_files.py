@@ -209,7 +209,8 @@ def pose_format(path: Path) -> str:
     """
     ending = max((e for e in POSE_WRITERS if path.name.lower().endswith(e)), key=len, default=None)
     if ending is None:
-        raise UsageError(where=path, expected=f"a name that ends with {', '.join(POSE_WRITERS)}")
+        found = f"no format of poses has the ending {path.suffix}" if path.suffix else "has no ending"
+        raise UsageError(found, where=path, expected=f"a name that ends with {', '.join(POSE_WRITERS)}")
     return ending
 
 

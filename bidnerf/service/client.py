@@ -57,25 +57,25 @@ class ServiceClient:
         per step of the depth image) and ``seed``.
         """
         edge = uuid.uuid4().hex
-        files = {
-            "photo": _png(photo) if hasattr(photo, "shape") else photo,
-            "depth": _npy(depth) if hasattr(depth, "shape") else depth,
-            "camera": camera,
-            "start": None if start is None else json.dumps(getattr(start, "tolist", lambda: start)()).encode(),
-        }
-        parts = [
-            _part(edge, name, str(value).encode()) for name, value in {**known, "map": map}.items() if value is not None
-        ]
-        for name, file in files.items():
-            if file is not None:
-                parts.append(
-                    _part(
-                        edge,
-                        name,
-                        file if isinstance(file, bytes) else Path(file).read_bytes(),
-                        name if isinstance(file, bytes) else Path(file).name,
-                    )
-                )
+        try:
+            files = {
+                "photo": _png(photo) if hasattr(photo, "shape") else photo,
+                "depth": _npy(depth) if hasattr(depth, "shape") else depth,
+                "camera": camera,
+                "start": None if start is None else json.dumps(getattr(start, "tolist", lambda: start)()).encode(),
+            }
+            parts = [
+                _part(edge, name, str(value).encode())
+                for name, value in {**known, "map": map}.items()
+                if value is not None
+            ]
+            for name, file in files.items():
+                if isinstance(file, bytes):
+                    parts.append(_part(edge, name, file, name))
+                elif file is not None:
+                    parts.append(_part(edge, name, Path(file).read_bytes(), Path(file).name))
+        except (OSError, TypeError, ValueError) as error:
+            raise ServiceError(0, f"the request cannot be made: {error}") from error
         body = b"".join(parts) + f"--{edge}--\r\n".encode()
         return self.ask("/localize", body, f"multipart/form-data; boundary={edge}")
 
@@ -94,7 +94,7 @@ class ServiceClient:
             status, retry_after, content = self._fetch(path, body, kind)
             try:
                 answer = json.loads(content)
-            except ValueError:
+            except (ValueError, RecursionError):
                 answer = None
             if status < 300 and isinstance(answer, dict):
                 return answer

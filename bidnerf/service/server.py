@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from bidnerf.service.settings import ServiceLimits, check_token
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.installation import import_extra
+from bidnerf_core.maps import read_description
 from bidnerf_core.settings import to_flat
 
 if TYPE_CHECKING:
@@ -83,6 +84,8 @@ def serve(
     """
     if not hasattr(os, "fork"):
         raise InputError("this system has no fork, but workers share the maps' memory by forking; use Linux or macOS")
+    for folder in maps_by_name(scenes).values():
+        read_description(folder)  # here rather than in the process that loads the maps, which imports torch first
     import_extra("uvicorn", "serve", "the service")
     token = choose_token(host, token)
     run_app(

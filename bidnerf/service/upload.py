@@ -7,12 +7,13 @@ import os
 from pathlib import Path
 
 from bidnerf.results import read_pose
-from bidnerf.service.models import WIDEST_HFOV, Upload
+from bidnerf.service.models import Upload
 from bidnerf_core.camera import CameraSource
 from bidnerf_core.datasets import DatasetOptions, Photos
 from bidnerf_core.errors import InputError, spelled
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import is_heif, read_header
+from bidnerf_core.settings import WIDEST_HFOV
 
 
 def read_upload(upload: Upload, usual: CameraSource, folder: Path, max_pixels: float) -> tuple[Photos, SE3 | None]:

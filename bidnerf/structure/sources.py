@@ -34,7 +34,7 @@ from bidnerf_core.datasets import (
     warn_about,
 )
 from bidnerf_core.errors import InputError
-from bidnerf_core.io import open_binary, read_header, read_image
+from bidnerf_core.io import looks_like_image, open_binary, read_header, read_image
 from bidnerf_core.progress import counter
 from bidnerf_core.training import sharpness
 
@@ -70,7 +70,9 @@ def photos_of(
     reader = find_reader(source)
     if not source.is_dir() and reader is None:
         raise InputError(
-            "is a file", where=source, expected=f"a folder of photos or a video ({', '.join(VIDEO_SUFFIXES)})"
+            "is a single photo" if looks_like_image(source) else "is a file",
+            where=source,
+            expected=f"a folder of photos from several places, or a video ({', '.join(VIDEO_SUFFIXES)})",
         )
     if reader is None:
         files = photos_below(source, out)

@@ -264,7 +264,11 @@ def acceptance_figures(localization: Localization, record: SearchRecord | None) 
     if isinstance(measured, Evidence):
         figures += _landmark_figures(measured)
     elif isinstance(measured, Support):
-        figures += _support_figures(measured)
+        figures += [
+            EvidenceFigure.of(WITHOUT_LANDMARKS[bound.measure], value, bound.limit, bound.is_least)
+            for bound, value in measured.bounds
+            if bound.measure in WITHOUT_LANDMARKS
+        ]
     if answer is not None and not isinstance(measured, Evidence):
         pose = name_earlier(localization, answer)
         figures += [replace(figure, pose=pose) for figure in _landmark_figures(answer.evidence)]
@@ -287,9 +291,3 @@ def _landmark_figures(evidence: Evidence) -> Iterator[EvidenceFigure]:
             )
         else:
             yield EvidenceFigure.of(text, value, bound.limit, bound.is_least)
-
-
-def _support_figures(measured: Support) -> Iterator[EvidenceFigure]:
-    for bound, value in measured.bounds:
-        if bound.measure in WITHOUT_LANDMARKS:
-            yield EvidenceFigure.of(WITHOUT_LANDMARKS[bound.measure], value, bound.limit, bound.is_least)

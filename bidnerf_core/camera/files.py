@@ -93,7 +93,7 @@ DISTORTIONS = {
 EXPECTED_YAML = "YAML from ROS (camera_info), OpenCV, ORB-SLAM or Kalibr with the intrinsics of one camera"
 CAMERA_FORMATS = (
     "a camera: JSON (fl_x or fx, K, mtx or camera_matrix), YAML of ROS, OpenCV or Kalibr, COLMAP's cameras.txt (from cameras.bin:"
-    " model_converter), ROS's ost.txt, XML of OpenCV or Agisoft, or a 3x3 matrix as text"
+    " model_converter), hloc's list of images, ROS's ost.txt, XML of OpenCV or Agisoft, or a 3x3 matrix as text"
 )
 """The files of cameras that are read, for messages."""
 OWN_KEYS = {"fx", "fy", "cx", "cy", "width", "height", "distortion"}
@@ -164,7 +164,7 @@ def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> 
     different cameras, the camera of the image named ``photo`` is used. Raises ``InputError`` for other files,
     and if the camera is ambiguous.
     """
-    content = read_file(path, "a camera file (JSON, YAML, COLMAP's cameras.txt or a list of images)")
+    content = read_file(path, CAMERA_FORMATS)
     start = content.lstrip(b"\xef\xbb\xbf \t\r\n")
     if start[:1] == b"[" and start[1:].lstrip()[:1] == b"{":
         return _choose(path, _splat_cameras(path, content), photo)
@@ -260,6 +260,8 @@ def _json_camera(record: Record, size: tuple[int, int]) -> Camera:
         values |= {"distortion_model": str(values.get("model", "")).rpartition(".")[2]}
     if any(values.get(key) for key in ("intrinsic_matrix", "intrinsic", *KEYS["K"])):
         return parse_calibration(record.where, values, size)
+    if not any(key in values for key in ("camera_model", "fl_x", "camera_angle_x")):
+        raise record.error("no focal length", expected=CAMERA_FORMATS)
     return camera_of_record(record, size)
 
 
@@ -302,12 +304,11 @@ def read_text_cameras(path: Path) -> dict[int, Camera]:
 
 def _text_cameras(path: Path, content: bytes, named: bool = True) -> dict[str, Camera]:
     """Parse rows of ``CAMERA_ID MODEL WIDTH HEIGHT PARAMS...``, or hloc's rows with an image name instead of the id."""
-    expected = f"a camera: {CAMERA_FORMATS}"
     cameras: dict[str, Camera] = {}
-    for row in parse_rows(content, path, expected, "CAMERA_ID MODEL WIDTH HEIGHT and parameters"):
+    for row in parse_rows(content, path, CAMERA_FORMATS, "CAMERA_ID MODEL WIDTH HEIGHT and parameters"):
         words = row.words
         if len(words) < 5:
-            raise row.error(f" has {len(words)} entries")
+            raise InputError(f"has {len(words)} entries", where=row.where, expected=CAMERA_FORMATS)
         if words[1] not in MODELS:
             raise InputError(f"camera model {words[1]}", where=row.where, expected=f"one of {', '.join(MODELS)}")
         key = words[0] if named and not words[0].lstrip("-").isdecimal() else str(row.integer(words[0]))

@@ -23,6 +23,7 @@ from torch import Tensor
 from bidnerf_core.camera.exif import Orientation
 from bidnerf_core.devices import constant
 from bidnerf_core.errors import InputError
+from bidnerf_core.settings import WIDEST_HFOV
 
 LIMITS: dict[str, tuple[type, float, float, str]] = {
     "focal length": (Real, 1e-6, 1e9, "a positive number, at least 1e-06 pixels and at most 1e+09 pixels"),
@@ -87,8 +88,8 @@ class Intrinsics:
             degrees,
             Real,
             1e-9,
-            math.nextafter(180, 0),
-            "degrees between 0 and 180 (both excluded)",
+            WIDEST_HFOV,
+            f"degrees above 0, at most {WIDEST_HFOV:g}",
         )
         check_number("width", width, *LIMITS["size"])
         return Intrinsics.from_focal(focal_length(width, math.radians(degrees)), width, height)

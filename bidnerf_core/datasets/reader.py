@@ -16,7 +16,7 @@ from bidnerf_core.datasets.options import DepthRegistration
 from bidnerf_core.depth import DepthCamera as DepthCamera  # for authors of readers
 from bidnerf_core.errors import InputError, InputWarning, amount, enumeration
 from bidnerf_core.frames import MaskFolder, photos_in
-from bidnerf_core.io import IMAGE_SUFFIXES, is_file
+from bidnerf_core.io import IMAGE_SUFFIXES, is_file, looks_like_image
 from bidnerf_core.io import Background as Background  # for authors of readers
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
 
@@ -320,6 +320,12 @@ def no_dataset(path: Path, readers: Sequence[Reader] | None = None, or_else: str
         if path.suffix.lower() in UNREAD_VIDEOS:
             return InputError(
                 "is a video in a container that is not read", where=path, expected="MP4: convert it first"
+            )
+        if looks_like_image(path):
+            return InputError(
+                "is a single photo, of which no map can be made",
+                where=path,
+                expected="a folder of photos of the scene from several places, a video, or the folder of a dataset",
             )
         is_archive = path.suffix.lower() in (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar")
         return InputError(

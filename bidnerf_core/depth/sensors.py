@@ -161,4 +161,7 @@ def describe_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics, se
         return None
     z = float(depth[depth > 0].median())
     estimated, expected = noise.deviation(z) / z, find_depth_sensor(sensor).noise.deviation(z) / z
-    return f"depth noise at {z:.3g} m is about {estimated:.2%}; {sensor!r} usually has {expected:.2%}"
+    return (
+        f"the depth scatters by about {estimated:.2%} of the distance at {z:.3g} m, that of a {sensor!r} usually by"
+        f" {expected:.2%}; `depth_sensor` states what measured it"
+    )

@@ -78,7 +78,7 @@ def parse_json(content: bytes | str, where: str, expected: str) -> Any:
     except InputError:
         raise
     except (ValueError, RecursionError) as error:
-        raise InputError(f"not JSON ({error})", where=where, expected=expected) from error
+        raise InputError(f"not JSON ({getattr(error, 'reason', error)})", where=where, expected=expected) from error
     return found
 
 

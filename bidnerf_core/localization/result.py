@@ -96,6 +96,7 @@ class Localization:
     intrinsics: Intrinsics | None = None  # of the last image, if other than the given ones were used
     unit: LengthUnit = "units"  # of the position and its covariance: that of the map
     picture: Callable[[Localization], str] | None = None  # returns the HTML of a picture for a notebook; not stored
+    name: str = ""  # of the image; not stored
 
     def _repr_html_(self) -> str:
         """Return HTML for a notebook: the photo, the map rendered at the estimated pose, and a blend of both, above a line of text."""
@@ -113,7 +114,7 @@ class Localization:
         where = (
             f"at ({x:.4g}, {y:.4g}, {z:.4g}) {symbol(self.unit)}" if self.T_world_camera.is_finite else "without a pose"
         )
-        return f"<Localization {self.outcome.value} {where}{sure}: {self.reason}>"
+        return f"<Localization {self.name and f'of {self.name}: '}{self.outcome.value} {where}{sure}: {self.reason}>"
 
     @staticmethod
     def of(

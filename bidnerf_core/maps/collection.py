@@ -21,7 +21,8 @@ from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import USUAL_METHOD, Localization, Outcome, Verdict, localize_by_landmarks
 from bidnerf_core.mapping import LandmarkMap, Vocabulary, detect, find_features, pool_views
-from bidnerf_core.maps.description import DESCRIPTION, cameras_of, load_info
+from bidnerf_core.maps.description import cameras_of, load_info
+from bidnerf_core.maps.description_file import DESCRIPTION
 from bidnerf_core.maps.localizer import Localizer
 from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.maps.scene import origin_of, unit_of

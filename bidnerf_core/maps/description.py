@@ -19,10 +19,9 @@ from bidnerf_core.geometry import SE3, LengthUnit, pose_from_matrix, scale_point
 from bidnerf_core.installation import with_writer
 from bidnerf_core.io import from_plain, read_json
 from bidnerf_core.mapping import USUAL_FEATURES
+from bidnerf_core.maps.description_file import DESCRIPTION, VERSION, read_description
 from bidnerf_core.settings import Above, NotNegative, Range, Settings
 
-VERSION = 1
-DESCRIPTION = "map.json"
 PART_NAMES = ("weights", "training", "surface", "landmarks", "capture")
 """The keys of ``map.json`` whose values are file names."""
 ANCHOR = "anchor.json"
@@ -154,23 +153,8 @@ def longest_side(info: MapInfo) -> int | None:
 
 def load_info(folder: Path) -> MapInfo:
     """Load and check ``map.json`` and any ``anchor.json``. Raises ``InputError`` unless they describe a map of this version."""
-    path = folder / DESCRIPTION
-    if not folder.is_dir():
-        raise InputError(
-            "is a file" if folder.exists() else "no such folder",
-            where=folder,
-            expected="a map: a folder as written by 'bidnerf train'",
-        )
-    if not path.exists():
-        raise InputError(f"no {DESCRIPTION} found", where=folder, expected="a map as written by 'bidnerf train'")
-    found = read_json(path, "the description of a map")
-    if not isinstance(found, dict) or found.get("format") != "bidnerf map":
-        raise InputError("not the description of a map", where=path, expected='"format": "bidnerf map"')
+    path, found = folder / DESCRIPTION, read_description(folder)
     writer = found.get("bidnerf")
-    if found.get("version") != VERSION:
-        newer = isinstance(found.get("version"), int) and found["version"] > VERSION
-        expected = f"{VERSION}; {'it was written by a newer bidnerf; upgrade bidnerf' if newer else 'retrain the map'}"
-        raise with_writer(InputError(f"version {found.get('version')!r}", where=path, expected=expected), writer)
     for part in PART_NAMES:
         name = found.get(part)
         if isinstance(name, str) and (not name or Path(name).name != name):

@@ -116,7 +116,8 @@ class Localizer:
         origin = origin_of(self.scene)
         near = None if start is None else start_pose(start).translated(-origin)
         problem = self.problem(query, near, depth_rays)
-        found, frame = self.solve(problem, seed).translated(origin), problem.views[-1].frame
+        frame = problem.views[-1].frame
+        found = replace(self.solve(problem, seed).translated(origin), name=frame.name)
         # Every n-th pixel, at most 240 along the longer side, since each rendered pixel takes time.
         step = -(-max(frame.intrinsics.width, frame.intrinsics.height) // 240)
         photo = frame.rgb_bytes[step // 2 :: step, step // 2 :: step].contiguous()
@@ -132,6 +133,8 @@ class Localizer:
         workers: int | None = None,
     ) -> Iterator[Localization | InputError]:
         """Localize independent queries, each as ``__call__`` does, and yield the answers in the order of the queries.
+
+        The ``name`` of an answer is that of its image, such as the stem of a photo's file, or else the number of the query, from 0.
 
         A query that cannot be localized at all yields its ``InputError`` in place of an answer. ``workers`` threads, each with its
         own stream on a GPU, localize at the same time: by default, as many as torch has threads or, on a GPU, 8.
@@ -162,10 +165,11 @@ class Localizer:
             if device.type == "cuda":
                 torch.cuda.set_stream(torch.cuda.Stream(device))
 
-        def answer(query: Any) -> Localization | InputError:
+        def answer(number: int, query: Any) -> Localization | InputError:
             with job_context(cancel=lambda: stopped.is_set() or (cancel is not None and cancel())):
                 try:
-                    return self(query, seed=seed)
+                    found = self(query, seed=seed)
+                    return replace(found, name=found.name or str(number))
                 except InputError as error:
                     return error
 
@@ -175,8 +179,8 @@ class Localizer:
             wait_for(device)
         with ThreadPoolExecutor(workers, "bidnerf-localizer", begin) as pool:
             try:
-                for query in queries:
-                    waiting.append(pool.submit(answer, query))
+                for number, query in enumerate(queries):
+                    waiting.append(pool.submit(answer, number, query))
                     while len(waiting) > 2 * workers or (waiting and waiting[0].done()):
                         count(done := done + 1, max(total, done))
                         yield waiting.popleft().result()

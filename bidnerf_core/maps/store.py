@@ -47,7 +47,8 @@ from bidnerf_core.mapping import (
     surface_from_tensors,
     surface_tensors,
 )
-from bidnerf_core.maps.description import ANCHOR, DESCRIPTION, PART_NAMES, MapInfo, load_info
+from bidnerf_core.maps.description import ANCHOR, PART_NAMES, MapInfo, load_info
+from bidnerf_core.maps.description_file import DESCRIPTION
 from bidnerf_core.progress import Progress, current_job, log
 from bidnerf_core.training import TrainingState, TrainingStep
 

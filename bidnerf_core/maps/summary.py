@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -121,7 +122,7 @@ class MapSummary:
             "frame": frame,
             "surface": built,
             "landmarks": str(facts["landmarks"] or "none; 'bidnerf bake MAP --data DATA' builds them"),
-            "settings": _shown(info.config) if info.config else "",
+            "settings": f"\n{'':13}".join(textwrap.wrap(_shown(info.config), 100)),
         }
         lines = (f"{key + ':':<12} {value}" for key, value in rows.items() if value)
         return "\n".join([*lines, *(f"- {sentence}" for sentence in self.remarks)])

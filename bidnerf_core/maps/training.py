@@ -37,7 +37,8 @@ from bidnerf_core.mapping import (
     TrackedViews,
     find_features,
 )
-from bidnerf_core.maps.description import DESCRIPTION, MapInfo, load_info, longest_side
+from bidnerf_core.maps.description import MapInfo, load_info, longest_side
+from bidnerf_core.maps.description_file import DESCRIPTION
 from bidnerf_core.maps.map import USUAL_BAKE, Map, load_map
 from bidnerf_core.maps.store import (
     USUAL_SECONDS,

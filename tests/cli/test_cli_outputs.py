@@ -15,13 +15,13 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 import torch
 
 # Inside: signals within sections that a command passes in microseconds, and paths that it must refuse
-from bidnerf import SE3, Frame, InputError, Intrinsics, Localization, Localizer, Outcome, Tracker
+from bidnerf import SE3, Cancelled, Frame, InputError, Intrinsics, Localization, Localizer, Outcome, Tracker
 from bidnerf.cli import main
 from bidnerf.cli.output import check_folder, check_output
 from bidnerf.cli.running import interruptible_work
@@ -150,6 +150,30 @@ def test_a_reader_that_goes_away_keeps_the_poses(
     out = tmp_path / "poses.json"
     assert main(["localize", "MAP", str(data), "--out", str(out), *words]) == 141
     assert [found["frame"] for found in json.loads(out.read_text())] == [f.name for _, f, _ in flight()[:2]]
+
+
+@pytest.mark.usefixtures("no_signal_ignored")
+@pytest.mark.parametrize(
+    ("words", "place", "kept"),
+    [
+        (["demo", "--out", "OUT"], "bidnerf_core.maps.train", "'bidnerf demo --out OUT --overwrite' starts again"),
+        (["import", "FILE", "--out", "OUT"], "bidnerf_core.maps.import_map", "OUT was not written"),
+    ],
+)
+def test_an_interrupted_command_advises_what_it_can_do(
+    words: list[str], place: str, kept: str, bidnerf: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: Any, **__: Any) -> NoReturn:
+        os.kill(os.getpid(), signal.SIGINT)
+        raise Cancelled("map: saved after step 3; `resume` continues from there")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(place, stopped)
+    monkeypatch.setattr("bidnerf.cli.demo.TRAINING_VIEWS", 2)
+    status, _, err = bidnerf(*words)
+    assert status == 130
+    assert kept in err
+    assert "--resume" not in err
 
 
 def test_handlers_are_as_before_after_a_command_and_ignored_signals_stay_ignored(bidnerf: Run) -> None:

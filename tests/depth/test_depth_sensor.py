@@ -69,7 +69,7 @@ def test_localize_compares_a_named_sensor_with_the_image(generator: Generator) -
     camera = Intrinsics.from_focal(100.0, 120, 90)
     depth = torch.linspace(1.0, 1.3, 120).expand(90, 120) * (1 + 0.02 * torch.randn((90, 120), generator=generator))
     sentence = require(describe_depth_noise(depth, camera, "kinect"))
-    assert re.search(r"is about (1\.[6-9]|2\.[0-4])\d%; 'kinect' usually has 0\.\d+%", sentence)
+    assert re.search(r"by about (1\.[6-9]|2\.[0-4])\d% of the distance .* a 'kinect' usually by 0\.\d+%", sentence)
     assert describe_depth_noise(torch.zeros_like(depth), camera, "kinect") is None
 
 

@@ -225,6 +225,9 @@ def test_many_queries_have_the_answers_of_each_alone_in_order() -> None:
         else:
             assert isinstance(answer, Localization)
             assert torch.equal(answer.poses.matrix(), made(query, seed=3).poses.matrix())
+    assert [answer.name for answer in found if isinstance(answer, Localization)] == [
+        query.name or str(number) for number, query in enumerate(queries) if not isinstance(query, Path)
+    ]
 
 
 def test_a_folder_of_photos_is_many_queries(tmp_path: Path) -> None:

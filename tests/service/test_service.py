@@ -380,6 +380,7 @@ def test_what_is_missing_is_named(service: Service, inputs: Inputs) -> None:
         (f"map=map&focal={'9' * 5000}", "focal is", "a number up to"),
         (f"map=map&seed={'9' * 5000}", "seed is"),
         ("map=map&hfov=179.9", "expected a number up to 170"),
+        ("map=map&hfov=0", "expected a number above 0"),
         ("map=map&focal=0.001", "focal is 0.001 for 24 columns, expected at least 1.05"),
     ):
         detail = service.post(f"/localize?{query}", inputs.photo).json["detail"]
@@ -591,6 +592,9 @@ def test_the_client_asks_a_server(inputs: Inputs, service: Service) -> None:
     assert client.localize(pixels[..., 0], "map", depth=depth, focal=32, start=start)["frame"] == "photo"
     with pytest.raises(ServiceError, match="float64"):
         client.localize(pixels / 2, "map")
+    for wrong in ({"photo": inputs.folder / "none.png"}, {"start": object()}, {"camera": 7}, {"name": "\ud800"}):
+        with pytest.raises(ServiceError, match="the request cannot be made: "):
+            client.localize(**{"photo": b"", **wrong})
     assert set(client.maps()) == {"map", "hall"}
     assert client.health()["status"] == "ok"
     with pytest.raises(ServiceError, match="no map with that name") as refused:
@@ -818,6 +822,13 @@ async def unmanaged(app: Any) -> AsyncIterator[None]:
 def test_the_listening_process_does_not_load_torch() -> None:
     program = "import sys; from bidnerf.service import service_app; service_app('MAP').openapi(); print('torch' in sys.modules)"
     assert subprocess.check_output([sys.executable, "-c", program], text=True) == "False\n"
+
+
+def test_what_is_no_map_is_refused_before_torch_is_imported() -> None:
+    program = "import sys; from bidnerf.cli import main; print(main(['serve', 'nomap']), 'torch' in sys.modules)"
+    found = subprocess.run([sys.executable, "-c", program], text=True, capture_output=True)
+    assert found.stdout == "1 False\n"
+    assert found.stderr.startswith("bidnerf serve: nomap: no such folder, expected a map")
 
 
 def test_startup_of_another_server_starts_the_pool(monkeypatch: pytest.MonkeyPatch) -> None:
