@@ -90,7 +90,6 @@ DISTORTIONS = {
     ),
 }
 """The names of distortion models in calibrations, in lower case, by our kind of model."""
-EXPECTED_YAML = "YAML from ROS (camera_info), OpenCV, ORB-SLAM or Kalibr with the intrinsics of one camera"
 CAMERA_FORMATS = (
     "a camera: JSON (fl_x or fx, K, mtx or camera_matrix), YAML of ROS, OpenCV or Kalibr, COLMAP's cameras.txt (from cameras.bin:"
     " model_converter), hloc's list of images, ROS's ost.txt, XML of OpenCV or Agisoft, or a 3x3 matrix as text"
@@ -173,7 +172,7 @@ def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> 
     if start[:1] in (b"{", b"["):
         return _json_camera(parse_record(str(path), content), size)
     if start.startswith((b"%YAML", b"---")) or path.suffix.lower() in (".yaml", ".yml"):
-        return parse_calibration(str(path), parse_yaml(content, str(path), EXPECTED_YAML), size)
+        return parse_calibration(str(path), parse_yaml(content, str(path), CAMERA_FORMATS), size)
     if start[:1] == b"<":
         return _xml_camera(path, content, size)
     rows = parse_rows(content, path, CAMERA_FORMATS, "CAMERA_ID MODEL WIDTH HEIGHT and parameters")
@@ -340,7 +339,7 @@ def parse_calibration(where: str, values: Mapping[str, Any], size: tuple[int, in
         names = ("k1", "k2", "k3", "k4") if model.lower() in DISTORTIONS[FISHEYE] else ("k1", "k2", "p1", "p2", "k3")
         four, lens = ([values.get(f"{slam}.{x}", 0.0) for x in some] for some in (("fx", "fy", "cx", "cy"), names))
     if given is None and four is None:
-        raise InputError(f"no camera matrix ({', '.join(KEYS['K'][:3])} or K)", where=where, expected=EXPECTED_YAML)
+        raise InputError(f"no camera matrix ({', '.join(KEYS['K'][:3])} or K)", where=where, expected=CAMERA_FORMATS)
     K = _array(where, four if given is None else given)
     if K.shape == (4,):
         K = np.array(((K[0], 0, K[2]), (0, K[1], K[3]), (0, 0, 1)))
