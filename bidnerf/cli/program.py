@@ -114,7 +114,15 @@ def _usage() -> str:
     infos = list_plugins("commands")
     width = max((len(info.name) for info in infos), default=0)
     lines = [f"  {info.name.ljust(width)}  {info.description}" for info in infos]
-    return "\n".join(["usage: bidnerf COMMAND ...", "", *lines, "", "'bidnerf demo' is a tour of two minutes; 'bidnerf COMMAND --help' describes a command."])
+    return "\n".join(
+        [
+            "usage: bidnerf COMMAND ...",
+            "",
+            *lines,
+            "",
+            "'bidnerf demo' is a tour of two minutes; 'bidnerf COMMAND --help' describes a command.",
+        ]
+    )
 
 
 @contextlib.contextmanager

@@ -57,6 +57,10 @@ class Answer:
     # Keypoints (pixels of the upright image) that agree with landmarks of the map, and the indices of these landmarks.
     matches: tuple[Float[Tensor, "m 2"], Int[Tensor, "m"]] | None = None
 
+    def __repr__(self) -> str:
+        """Return a one-line description."""
+        return f"<Answer {self.name}: {self.localization!r}>"
+
     @staticmethod
     def of(frame: Frame, number: int, localization: Localization, **about: Any) -> Answer:
         """Build the answer for a frame; ``about`` holds further attributes of the answer.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -106,7 +106,7 @@ def localize(
 
 def _queries(localizer: Localizer | MapCollection, given: Any) -> QuerySource:
     """Return photos, frames and a dataset as queries. Raises ``InputError`` for anything else."""
-    listed = [given] if isinstance(given, str | Path | Frame | View) else list(given)
+    listed = [given] if isinstance(given, str | Path | Frame | View) or not isinstance(given, Iterable) else [*given]
     paths = [Path(each) for each in listed if isinstance(each, str | Path)]
     if listed and len(paths) == len(listed):
         assumed, background = (

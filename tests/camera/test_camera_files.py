@@ -308,7 +308,7 @@ def test_the_camera_of_a_photo_is_chosen_by_its_name(tmp_path: Path) -> None:
     ("content", "found", "expected"),
     [
         ("a: [1, 2", "is not YAML", None),
-        ("just words", None, "YAML from ROS"),
+        ("just words", None, "YAML of ROS"),
         ("image_width: 640\n", "no camera matrix", None),
         (ros_info(CAMERA).replace("plumb_bob", "double_sphere"), "model double_sphere", "plumb_bob"),
         (ros_info(CAMERA).replace("500.0", "fast"), "fast", "numbers"),

@@ -289,6 +289,9 @@ def test_what_is_localized_may_be_given_in_any_form(folder: Path) -> None:
     assert bn.localize(known, [photo, photo.parent / "none.png"]).names == [photo.stem, "none"]
     with refused(where="queries", found="got a int", expected="photos by path, or a Frame, View or list of Views"):
         bn.localize(known, [7])  # type: ignore[list-item]
+    with refused(where="queries", found="got a int"):
+        bn.localize(known, 7)  # type: ignore[arg-type]
+    assert repr(first).startswith(f"<Answer {first.name}: <Localization of {first.name}: converged at (")
 
 
 def answers_with(poses: list[SE3], truths: list[SE3]) -> Answers:
