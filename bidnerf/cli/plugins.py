@@ -68,8 +68,9 @@ def run_doctor(json: Json = False) -> None:
         rows += [["device", device] for device in found["devices"]]
         rows += [[requirement.name, requirement.installed or "missing"] for requirement in needed]
         for name, unmet in extras.items():
-            missing = f"{', '.join(map(str, unmet))}; optional: pip install 'bidnerf[{name}]'"
-            rows.append([f"extra {name}", missing if unmet else "installed"])
+            outdated = ", ".join(str(each) for each in unmet if each.installed)
+            absent = f"not installed; pip install 'bidnerf[{name}]' adds it"
+            rows.append([f"extra {name}", "installed" if not unmet else outdated or absent])
         for name, text in [*rows, *(["plugin", text] for text in plugins)]:
             show(f"{name:<22}  {text}")  # a line each at any width of the terminal, since it is pasted into reports
     if broken:

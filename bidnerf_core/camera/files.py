@@ -307,7 +307,7 @@ def _text_cameras(path: Path, content: bytes, named: bool = True) -> dict[str, C
     for row in parse_rows(content, path, CAMERA_FORMATS, "CAMERA_ID MODEL WIDTH HEIGHT and parameters"):
         words = row.words
         if len(words) < 5:
-            raise InputError(f"has {len(words)} entries", where=row.where, expected=CAMERA_FORMATS)
+            raise InputError(f"line {row.line} has {len(words)} entries", where=path, expected=CAMERA_FORMATS)
         if words[1] not in MODELS:
             raise InputError(f"camera model {words[1]}", where=row.where, expected=f"one of {', '.join(MODELS)}")
         key = words[0] if named and not words[0].lstrip("-").isdecimal() else str(row.integer(words[0]))

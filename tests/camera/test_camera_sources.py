@@ -308,7 +308,7 @@ def test_models_of_colmap_are_those_of_pycolmap(model: str, data: st.DataObject,
     [
         ("# nothing\n", "", "0 cameras", "exactly one"),
         ("1 PINHOLE 4 3 1 1 2 2\n2 PINHOLE 4 3 2 1 2 2\n", "", "2 cameras", "exactly one"),
-        ("1 PINHOLE 3 4\n", ": line 1", "has 4 entries", "hloc's list of images"),
+        ("1 PINHOLE 3 4\n", "", "line 1 has 4 entries", "hloc's list of images"),
         ("1 PINHOLE 4 3 a 1 2 2\n", "", "line 1: could not convert", "CAMERA_ID"),
         ("1 THIN_PRISM_FISHEYE 4 3 1 1 2 2 0 0 0\n", ": line 1", "THIN_PRISM_FISHEYE", "SIMPLE_PINHOLE"),
         ("\n1 PINHOLE 4 3 1 1 2\n", ": line 2", "PINHOLE has 3 parameters", 4),

@@ -18,16 +18,17 @@ from bidnerf import SE3, Localizer
 
 # Inside: the starts of --perturb and the arguments QUERY, without a localization of each
 from bidnerf.cli.localize import StartOptions
-from bidnerf.cli.options import QueryOptions
+from bidnerf.cli.options import TEST_IMAGES, QueryOptions
 from bidnerf.results import pose_error
 from bidnerf.testing import unseen
-from bidnerf_core.datasets import DatasetOptions, Photos, Query, open_dataset
+from bidnerf_core.datasets import Photos, Query, open_dataset
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.localization import Outcome
 from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.maps import load_info
 from bombs import png_of
 from commands import Run, assert_refused
+from stored_ground import open_ground
 
 FOCAL = ["--focal", tiny.CAMERA.fx]
 QUICK = ["--method", "bid", "--max-steps", "2", "--rays", "64"]
@@ -83,6 +84,19 @@ def test_a_photo_has_no_error_since_it_has_no_truth(bidnerf: Run, given: Path, p
     assert out.startswith("t_0001: ")
     assert "error" not in out
     assert out.splitlines()[-5].startswith("  T_world_camera (camera axes x right")
+
+
+def test_an_answer_without_a_pose_shows_no_numbers(
+    bidnerf: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    open_ground(monkeypatch)
+    (tmp_path / "black.png").write_bytes(png_of(128, 96))
+    words = ["localize", "MAP", tmp_path / "black.png", "--focal", 130]
+    first, *more = bidnerf(*words).succeed().out.splitlines()
+    assert first.startswith("black: refused: ")
+    assert more == ["  no pose, since nothing was recognised"]
+    (found,) = objects(bidnerf(*words, "--json").succeed().out)
+    assert (found["T_world_camera"], found["converged"]) == (None, False)
 
 
 def test_depth_that_is_missing_or_without_a_measurement_is_told(
@@ -262,5 +276,5 @@ def test_a_photo_that_cannot_be_opened_does_not_stop_the_others(
         raise InputError("permission denied", where=path)
 
     monkeypatch.setattr("bidnerf_core.io.open_binary", deny)
-    photos = QueryOptions().opener(files, DatasetOptions())([], None)
+    photos = QueryOptions().opener(files, TEST_IMAGES)([], None)
     assert list(photos.names) == ["a", "b"]
