@@ -16,7 +16,7 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics, cameras_at_size
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.matching import QueryKeypoints
-from bidnerf_core.mapping import LandmarkMap, N, States
+from bidnerf_core.mapping import MOTION, LandmarkMap, N, States
 
 # fmt: off
 STATED = (
@@ -49,6 +49,12 @@ OF_MAP = (
 """Hypotheses that the camera is one of the map's: standard deviations about that camera, as in ``STATED``, and shares of its odds."""
 NEARLY = (0.002, 0.002, 0.002, 0.002, 0.001, 0.001)
 """Differences to be expected between two good calibrations of one camera, in the order of ``NUISANCES``."""
+SPURIOUS_MOTION = 0.002
+"""Standard deviation of the motions that landmarks suggest even of cameras at rest: translations relative to the distance of the scene,
+and rotations in radians.
+
+Photos of the doll, most of which were taken at rest, have apparent motions of 0.003, about as much as these fits are uncertain.
+"""
 CAMERAS = {
     "exact": "the given camera",
     "right": "the given camera (well calibrated)",
@@ -87,6 +93,7 @@ class Explanations:
     deviation: Float[Tensor, "k N"]
     log_prior: Float[Tensor, "k"]
     credible: Bool[Tensor, "k"]  # whether a pose under it counts as right
+    scatter: Float[Tensor, "N"]  # standard deviations of the spurious part of the nuisances
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -173,10 +180,14 @@ def explanations(
     ]
     names, moves, means, deviations, shares, right = zip(*every, strict=True)
     mean, deviation, prior = (torch.tensor(values, dtype=torch.float64) for values in (means, deviations, shares))
-    # Landmarks of this map suggest corrections even of right intrinsics; see ``calibration_scatter``.
+    # Landmarks of this map suggest corrections even of right intrinsics, and motions even of cameras at rest.
+    scatter = torch.zeros(N, dtype=torch.float64)
     if query.has_one_camera:
-        deviation[:, :4] = torch.hypot(deviation[:, :4], landmarks.calibration_scatter.double())
-    return Explanations(names, torch.tensor(moves), mean, deviation, prior.log(), torch.tensor(right))
+        scatter[:4] = landmarks.calibration_scatter
+    if single:
+        scatter[MOTION] = SPURIOUS_MOTION * torch.tensor([distance] * 3 + [1.0] * 3, dtype=torch.float64)
+    deviation = torch.hypot(deviation, scatter)
+    return Explanations(names, torch.tensor(moves), mean, deviation, prior.log(), torch.tensor(right), scatter)
 
 
 def motion_prior(landmarks: LandmarkMap, distance: float) -> tuple[float, list[float]]:

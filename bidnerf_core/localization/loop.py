@@ -190,14 +190,14 @@ class Loop:
         """Fuse all measurements under all explanations, and judge the result; rays are rendered only where they can change it."""
         terms, fused, others = list[CostTerm]([landmarks]), list[str](), dict[str, float | None]()
         fit = self._settle(fit_landmarks, best, torch.arange(len(best)), landmarks, given)
-        found = self._posterior(fit, landmarks)
+        found = self._posterior(fit, landmarks, given)
         points = self._points(found.chosen)
         if points is not None:
             terms.append(points)
             fused.append("depth")
             fit = run_on(self.device, fit_modes, fit.likeliest, terms, given, 5)
             fit = replace(fit, log_odds=-run_on(self.device, cost_of, points, fit.about))
-            found = self._posterior(fit, landmarks)
+            found = self._posterior(fit, landmarks, given)
             near, both = run_on(self.device, agreement, points, found.chosen)
             others |= {"on_surface": float(near), "colour_inliers": float(both)}
         answer = self._judged(found, modes, landmarks, given, searched, others)
@@ -227,7 +227,7 @@ class Loop:
         # A place that was not rendered counts as if the map showed it as well as any other.
         log_odds = -Images.INDEPENDENT * loss.nan_to_num(float(loss.nan_to_num(torch.inf).amin()))
         systematic = (factor - 1)[:, None, None] * fit.by_rays[states.mode]
-        found = self._posterior(replace(fit, log_odds=log_odds, systematic=systematic), landmarks)
+        found = self._posterior(replace(fit, log_odds=log_odds, systematic=systematic), landmarks, given)
         if trial.difference > 0:
             others["difference"] = float(difference[found.mode])
         answer = self._judged(found, modes, landmarks, given, searched, others)
@@ -299,7 +299,7 @@ class Loop:
                 break
         return found
 
-    def _posterior(self, fit: ModeFits, landmarks: Landmarks) -> Posterior:
+    def _posterior(self, fit: ModeFits, landmarks: Landmarks, given: Explanations) -> Posterior:
         """Return the posterior over the explanations; of two places that look the same, the one nearer to the start is likelier."""
         if self.problem is not None and (start := self.problem.start) is not None:
             update = (start.inverse() @ fit.quadratic.here.T).log()
@@ -307,7 +307,7 @@ class Loop:
             away = update[:, :3].norm(dim=-1) + reach * update[:, 3:].norm(dim=-1)
             # In six dimensions, the density of a normal distribution of unknown width falls with the sixth power of the distance.
             fit = replace(fit, log_odds=fit.log_odds - 6.0 * away.clamp(min=1e-9).log())
-        return Posterior.of(fit, landmarks, self.landmarks.calibration_scatter.double(), self.device)
+        return Posterior.of(fit, landmarks, given.scatter, self.device)
 
     def _judged(
         self,

@@ -78,12 +78,12 @@ class Posterior:
     def of(
         fit: ModeFits,
         landmarks: Landmarks,
-        scatter: Float[Tensor, "4"],
+        scatter: Float[Tensor, "N"],
         device: torch.device = torch.device("cpu"),  # noqa: B008
     ) -> Posterior:
         """Compare explanations within a mode by their weights, and modes by the evidence of ``landmarks`` and their prior log odds.
 
-        ``scatter`` are the standard deviations of spurious corrections of a camera. Most of the computation runs on ``device``.
+        ``scatter`` are the standard deviations of the spurious part of the nuisances. Most of the computation runs on ``device``.
         """
         states, normal, weights = fit.states, fit.normal, fit.weights
         by_mode, information = run_on(device, _information, states, normal, fit.quadratic, landmarks, fit.systematic)
@@ -96,7 +96,7 @@ class Posterior:
         # Finite, so that explanations none of which is determined are equally probable.
         probability = log.nan_to_num(-1e300, neginf=-1e300).softmax(0)
         best = int(probability.argmax())
-        states, covariance = _true_cameras(states, normal, _robust_covariance(*information), scatter)
+        states, covariance = _true_nuisances(states, normal, _robust_covariance(*information), scatter)
         anchor = states.T[best]
         return Posterior(states, normal, probability, covariance, (anchor.inverse() @ states.T).log(), best)
 
@@ -231,23 +231,22 @@ def _robust_covariance(
     return torch.where(sound[:, None, None], found, torch.inf)
 
 
-def _true_cameras(
-    states: States, normal: Normal, covariance: Float[Tensor, "h P P"], scatter: Float[Tensor, "4"]
+def _true_nuisances(
+    states: States, normal: Normal, covariance: Float[Tensor, "h P P"], scatter: Float[Tensor, "N"]
 ) -> tuple[States, Float[Tensor, "h 6 6"]]:
-    """Return the states with the most probable true cameras, and the covariance of their poses.
+    """Return the states with the most probable true nuisances, and the covariance of their poses.
 
-    The apparent camera is the true camera plus a spurious part, due to landmark errors, of standard deviation ``scatter``. The pose
-    follows the true camera, in which it is linear once the other unknowns are eliminated.
+    The apparent camera, or motion, is the true one plus a spurious part, due to landmark errors, of standard deviation ``scatter``. The
+    pose follows the true one, in which it is linear once the other unknowns are eliminated.
     """
     H = normal.hessian
-    apparent = states.deviation[:, :4].square()  # = prior + scatter^2
-    prior = (apparent - scatter.square()).clamp(min=0)
-    share, doubt = torch.ones_like(states.z), torch.zeros_like(states.z)
-    share[:, :4] = prior / apparent.clamp(min=1e-24)
+    apparent, spurious = states.deviation.square().clamp(min=1e-24), scatter.square()  # apparent = prior + spurious
+    prior = torch.where(spurious > 0, (apparent - spurious).clamp(min=0), apparent)
+    share = prior / apparent
     # Part of what seems spurious may be real: as lenses move with focus and image stabilisers, no photo rules out a standard
     # deviation of 0.005 of a camera's parameters.
-    least = prior.clamp(min=0.005**2) + scatter.square() / 2
-    doubt[:, :4] = least * scatter.square() / (least + scatter.square()) / apparent.clamp(min=1e-24)
+    least = spurious / 2 + torch.cat([prior[:, :4].clamp(min=0.005**2), prior[:, 4:]], -1)
+    doubt = least * spurious / (least + spurious) / apparent
     follows = -torch.linalg.solve_ex(H[:, :6, :6], H[:, :6, 6:])[0]  # (h 6 N) by the whitened nuisances
     step = (share - 1) * states.z
     eye = torch.eye(6, dtype=H.dtype, device=H.device).expand(len(H), 6, 6)

@@ -30,7 +30,7 @@ from bidnerf_core.mapping import (
 M, FOCAL, NOISE = 150, 300.0, 0.5  # matches; pixels
 CAMERA = torch.tensor([0.01, 0.01, 0.01, 0.01, 0.001, 0.0], dtype=torch.float64)
 TRUTH = SE3.exp(torch.tensor([0.3, -0.2, 0.1, 0.2, -0.1, 0.3], dtype=torch.float64))
-NO_SCATTER = torch.zeros(4, dtype=torch.float64)
+NO_SCATTER = torch.zeros(len(NUISANCES), dtype=torch.float64)
 NOTHING = torch.zeros((6, 6), dtype=torch.float64)
 
 
@@ -51,7 +51,8 @@ def matches(seed: int, outliers: float = 0.0, nuisances: Tensor | None = None, m
     z = 3 + 2 * torch.rand((m, 1), generator=generator, dtype=torch.float64)
     points = TRUTH.apply(torch.cat([1.2 * flat * z, z], -1))[None]
     eye, zero = torch.eye(3, dtype=torch.float64).expand(m, 3, 3), torch.zeros((m, 3), dtype=torch.float64)
-    sights = Sights(zero[:, :2], zero[:, 0], eye, zero)
+    times = flat[:, 1]  # the rows are exposed one after the other
+    sights = Sights(zero[:, :2], times, eye, zero)
     true = state(deviation())
     true = true if nuisances is None else replace(true, mean=nuisances[None])
     noise = torch.randn((m, 2), generator=generator, dtype=torch.float64)
@@ -59,7 +60,7 @@ def matches(seed: int, outliers: float = 0.0, nuisances: Tensor | None = None, m
     wrong = torch.rand(m, generator=generator) < outliers
     image[wrong] = 1.2 * (torch.rand((int(wrong.sum()), 2), generator=generator, dtype=torch.float64) - 0.5)
     one = torch.ones((1, m), dtype=torch.float64)
-    seen = Sights(image[None], one * 0, eye[None], zero[None])
+    seen = Sights(image[None], times[None], eye[None], zero[None])
     each = one[:, 0]
     return Landmarks(points, seen, one, 0 * one, FOCAL * one, each, each, 400 * 300.0, 5.0)
 
@@ -81,7 +82,8 @@ def solved(
     found = term.with_noise(found)
     term = term.weighted_for(found)
     found, _ = descend(found, [term], 5)
-    wider = found.under(torch.zeros_like(free.mean[0]), deviation(CAMERA.clamp(min=0.01)))
+    widest = torch.maximum(deviation(CAMERA.clamp(min=0.01)), free.deviation[0])
+    wider = found.under(torch.zeros_like(free.mean[0]), widest)
     quadratic = Quadratic.of(total(wider, [term]) - prior(wider), wider)
     given = free if explained is None else explained
     index = torch.zeros(len(given), dtype=torch.long)
@@ -234,6 +236,16 @@ def test_the_pose_is_that_of_the_true_camera_where_the_apparent_one_is_spurious(
     errors, spreads = zip(*depths, strict=True)
     assert errors[2] > 0.05 > errors[0]  # 2 % of the distance, about
     assert spreads == tuple(sorted(spreads))
+
+
+def test_the_pose_is_that_of_a_camera_at_rest_where_its_motion_is_spurious() -> None:
+    motion = torch.zeros_like(NO_SCATTER)
+    motion[6:12] = 0.005
+    term = matches(0, nuisances=motion)
+    free, spurious = (solved(term, motion, scatter).pose() for scatter in (NO_SCATTER, motion))
+    still = solved(term, NO_SCATTER).pose()
+    away = [float((pose.inverse() @ still).log().norm()) for pose in (free, spurious)]
+    assert away[1] < 0.3 * away[0]  # the robust weights differ
 
 
 DEGENERATE: dict[str, Callable[[Tensor], Tensor]] = {

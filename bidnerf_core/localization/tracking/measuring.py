@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from bidnerf_core.depth import DepthSensorModel
 from bidnerf_core.fields import has_field
@@ -190,7 +191,7 @@ class Measurer:
         Whether the camera moved during the readout, and the effects of its intrinsics and of correlated errors, are estimated only in
         frames in which landmarks are recognised; they change little until the next such frame.
         """
-        scatter = landmarks.calibration_scatter.double()
+        scatter = pad(landmarks.calibration_scatter, (0, N - 4))
         moving, motion_deviation = motion_prior(landmarks, fit.term.distance(fit.states))
         deviation = torch.zeros((2, N), dtype=torch.float64)
         deviation[1, MOTION] = torch.tensor(motion_deviation, dtype=torch.float64)
@@ -198,7 +199,7 @@ class Measurer:
         log_prior = torch.tensor([1 - moving, moving], dtype=torch.float64).log()
         both = torch.tensor([False, True])
         given = Explanations(
-            ("exact", "exact"), both, 0 * deviation, deviation, log_prior, torch.ones(2, dtype=torch.bool)
+            ("exact", "exact"), both, 0 * deviation, deviation, log_prior, torch.ones(2, dtype=torch.bool), scatter
         )
         states, rounds = given.about(fit.states), 2
         if not fit.is_recognised:
@@ -216,7 +217,7 @@ class Measurer:
         here, covariance, doubt = states[best], torch.linalg.inv_ex(normal.hessian[best])[0][0, :6, :6], state.doubt
         if fit.is_recognised:
             exact = torch.tensor(STATED[0][1:5], dtype=torch.float64)
-            deviation[:, :4] = torch.hypot(exact, scatter)  # the camera is free
+            deviation[:, :4] = torch.hypot(exact, scatter[:4])  # the camera is free
             mixture = Posterior.of(fit_modes(here, terms, given, 0), term, scatter).mixture()
             if not bool((mixture + covariance).isfinite().all()):
                 why = Verdict(Outcome.UNDETERMINED, "the landmarks do not determine the pose")
