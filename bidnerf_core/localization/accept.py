@@ -125,11 +125,11 @@ LANDMARK_BOUNDS = (
         "the image contradicts the stated intrinsics, which are right with a probability of {0:.0%}",
     ),
     Bound("precision", 0.03, False, Outcome.IMPRECISE, "the position is uncertain by {0:.1%} of the distance", True),
-    # On record (``answers_halves``: four maps of each of six scenes, and planes, with and without faults), 586 answers are accepted, 19 of
-    # which are wrong. The bound was chosen on earlier answers to the same images.
+    # Chosen on the answers of Lego's maps on record (``answers_halves``, ``answers_unchanged``): of those that no other bound refuses, none
+    # of the wrong ones differs by 1.4 to 2.4. Between 1.6 and 2.0, 7 answers in maps of Mic and the room are right, none is wrong.
     Bound(
         "difference",
-        1.6,
+        2.0,
         False,
         Outcome.RENDERING_MISMATCH,
         "the image differs {0:.1f} times as much from its rendering as the map's own images",
