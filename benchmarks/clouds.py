@@ -146,7 +146,7 @@ class Open3d:
         """Register a frame to the map without a start."""
         registration = self.library.pipelines.registration
         target, target_features = self.features(config.voxel)
-        source, source_features = self._described(self._seen(measured, config.voxel), config.voxel)
+        source, source_features = self._describe(self._seen(measured, config.voxel), config.voxel)
         reach = config.distance * config.voxel
         found = registration.registration_ransac_based_on_feature_matching(
             source,
@@ -189,7 +189,7 @@ class Open3d:
         return T
 
     def _features(self, voxel: float) -> tuple[Any, Any]:
-        return self._described(self.at(voxel), voxel)
+        return self._describe(self.at(voxel), voxel)
 
     def _describe(self, cloud: Any, voxel: float) -> tuple[Any, Any]:
         """Return a cloud and its FPFH features, with radii as in the library's tutorial on global registration."""

@@ -33,19 +33,15 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 
 IMAGES = tuple(f"bidnerf_core/{package}" for package in ("camera", "depth", "fields", "frames", "geometry"))
-LOCALIZATION = (*IMAGES, "bidnerf_core/localization", "bidnerf_core/mapping", "backends/bidnerf_hashgrid")
+HASHGRID = "backends/bidnerf_hashgrid"
+LOCALIZER = "bidnerf_core/maps/localizer.py"
+LOCALIZATION = (*IMAGES, "bidnerf_core/localization", "bidnerf_core/mapping", LOCALIZER, HASHGRID)
 TRAINING = (*LOCALIZATION, "bidnerf_core/carving", "bidnerf_core/training")
-DESCENT = (
-    *IMAGES,
-    *(
-        f"bidnerf_core/localization/{part}"
-        for part in ("localizer.py", "methods.py", "problem.py", "settings.py", "terms")
-    ),
-    "backends/bidnerf_bid",
-    "backends/bidnerf_hashgrid",
-)
+SHARED = tuple(f"bidnerf_core/localization/{part}" for part in ("methods.py", "problem.py", "settings.py", "terms"))
+DESCENT = (*IMAGES, *SHARED, LOCALIZER, "backends/bidnerf_bid", HASHGRID)
 MEASURED: Mapping[str, Sequence[str]] = {
-    "map_|quick_maps|standard_": TRAINING,
+    "quick_maps|standard_": TRAINING,
+    "tracking": (*LOCALIZATION, "bidnerf_core/maps/tracker.py"),
     "bid_|inerf_|table": DESCENT,
     "faults_": (*LOCALIZATION, "bidnerf/evaluation/faults"),
     "detectors": (*LOCALIZATION, "plugins/bidnerf-xfeat"),

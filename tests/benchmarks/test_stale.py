@@ -94,3 +94,9 @@ def test_a_record_is_made_anew_and_an_interrupted_run_goes_on(repository: Reposi
     assert repository.check("--make") == (0, "")
     assert rows.read_text() == "a row\n" * 2
     assert repository.check() == (0, "")
+
+
+def test_records_depend_on_what_there_is(script: Callable[[str], ModuleType]) -> None:
+    stale = script("stale")
+    paths = {path for some in stale.MEASURED.values() for path in some}
+    assert {path for path in paths if not (stale.ROOT / path).exists()} == set()
