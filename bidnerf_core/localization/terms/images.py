@@ -67,7 +67,7 @@ def field_renderer(field: RadianceField, bounds: SceneBounds) -> Renderer:
 class Images:
     """Cost of small images: the mean over pixels of ``1 - 1 / (1 + c^2 / s^2)``, times ``INDEPENDENT``.
 
-    Here, c is the difference between rendered and measured colour, and s is ``COLOUR``.
+    Here, c is the difference between rendered and measured colour, and s is ``COLOUR_SCALE``.
 
     Colours are linearized with second-order accuracy, using the mean of both images' gradients (Benhimane and Malis 2004, "Real-time
     image-based tracking of planes using efficient second-order minimization"). Only the pose has derivatives. The cost is infinite for
@@ -76,7 +76,7 @@ class Images:
 
     INDEPENDENT: ClassVar[float] = 60.0
     """Number of independent measurements in a small image."""
-    COLOUR: ClassVar[float] = 0.2
+    COLOUR_SCALE: ClassVar[float] = 0.2
     """Norm of a pixel's colour difference (three channels) at which its inlier weight is one half."""
 
     renderer: Renderer
@@ -103,14 +103,14 @@ class Images:
         seen, measured, sure = rgb.mT, small.rgb.flatten(1).mT, known[..., None]
 
         def inlier(off: Tensor) -> Tensor:
-            return inlier_weight(off.square().sum(-1, keepdim=True), self.COLOUR)
+            return inlier_weight(off.square().sum(-1, keepdim=True), self.COLOUR_SCALE)
 
         gain, offset = fit_exposure(
             seen,
             measured,
             lambda off: inlier(off).square().expand_as(off),
             sure,
-            ((self.COLOUR / self.gain) ** 2, (self.COLOUR / 0.1) ** 2),
+            ((self.COLOUR_SCALE / self.gain) ** 2, (self.COLOUR_SCALE / 0.1) ** 2),
             self.rounds,
         )
         corrected = gain * seen + offset
@@ -120,7 +120,7 @@ class Images:
         cost = (sure * (1 - near) + (1 - sure) * 0.7)[..., 0].mean(-1)
         # Where the camera clips, the colour does not depend on the pose.
         inside = (corrected - 0.5).abs() < 0.5
-        weight = inside * (sure * near.square() * (2 / self.COLOUR**2 / error.shape[1]))
+        weight = inside * (sure * near.square() * (2 / self.COLOUR_SCALE**2 / error.shape[1]))
         slope = (slopes(rgb.unflatten(-1, small.rgb.shape[1:]), small.camera) + small.slopes) / 2
         # A point (X, Y, Z) is seen at x = X / Z, y = Y / Z, and moves there by (dX - x dZ, dY - y dZ) / Z.
         by_z = -(slope * small.flat[:, :2]).sum(-1, keepdim=True)
