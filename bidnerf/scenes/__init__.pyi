@@ -10,9 +10,9 @@ from .demo import demo_object as demo_object
 from .demo import demo_room as demo_room
 from .fields import GaussianBlobs as GaussianBlobs
 from .fields import MovedField as MovedField
-from .primitives import Box as Box
 from .primitives import Primitive as Primitive
 from .primitives import Shape as Shape
-from .primitives import Sphere as Sphere
 from .primitives import Texture as Texture
+from .primitives import ball as ball
 from .primitives import blotches as blotches
+from .primitives import box as box

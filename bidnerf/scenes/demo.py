@@ -13,15 +13,15 @@ import torch
 
 from bidnerf.scenes.closed_form import ClosedFormScene
 from bidnerf.scenes.primitives import (
-    Box,
-    Cylinder,
     Faces,
     Primitive,
     Shape,
-    Sphere,
     Texture,
+    ball,
     blotches,
+    box,
     checker,
+    cylinder,
     stripes,
 )
 from bidnerf_core.fields import SceneBounds
@@ -71,25 +71,25 @@ def _lorry() -> list[Primitive]:
     for (x, y), radius, hub in tyres:
         position = (x, y, radius - 0.85)
         outward = math.copysign(0.1, y)
-        wheels.append(_solid(Cylinder(radius, 0.1), position, checker(C.slate, C.navy, 0.24, phase=x), roll=90))
+        wheels.append(_solid(cylinder(radius, 0.1), position, checker(C.slate, C.navy, 0.24, phase=x), roll=90))
         cap = (x, y + outward, radius - 0.85)
-        wheels.append(_solid(Cylinder(0.6 * radius, 0.03), cap, blotches(hub, C.red, 0.25, round(9 * x * y)), roll=90))
+        wheels.append(_solid(cylinder(0.6 * radius, 0.03), cap, blotches(hub, C.red, 0.25, round(9 * x * y)), roll=90))
     return [
-        _solid(Box((0.9, 0.36, 0.09)), (0, 0, -0.36), stripes(C.navy, C.blue, (1, 0.6, 0), 0.3)),
-        _solid(Box((0.24, 0.38, 0.38)), (0.44, 0, 0.1), blotches(C.red, C.orange, 0.5, 1)),
-        _solid(Box((0.2, 0.39, 0.13)), (0.46, 0, 0.24), stripes(C.sky, C.white, (1, 0, 1), 0.32)),
-        _solid(Box((0.16, 0.33, 0.19)), (0.79, 0, -0.09), checker(C.red, C.sand, (0.4, 0.3, 0.4))),
-        _solid(Cylinder(0.07, 0.3), (0.76, 0.24, 0.3), stripes(C.slate, C.cream, (0, 0, 1), 0.2)),
-        _solid(Sphere(0.085), (0.91, -0.19, -0.02), blotches(C.sand, C.white, 0.2, 2)),
-        _solid(Sphere(0.085), (0.91, 0.19, -0.02), blotches(C.sand, C.orange, 0.2, 3)),
+        _solid(box((0.9, 0.36, 0.09)), (0, 0, -0.36), stripes(C.navy, C.blue, (1, 0.6, 0), 0.3)),
+        _solid(box((0.24, 0.38, 0.38)), (0.44, 0, 0.1), blotches(C.red, C.orange, 0.5, 1)),
+        _solid(box((0.2, 0.39, 0.13)), (0.46, 0, 0.24), stripes(C.sky, C.white, (1, 0, 1), 0.32)),
+        _solid(box((0.16, 0.33, 0.19)), (0.79, 0, -0.09), checker(C.red, C.sand, (0.4, 0.3, 0.4))),
+        _solid(cylinder(0.07, 0.3), (0.76, 0.24, 0.3), stripes(C.slate, C.cream, (0, 0, 1), 0.2)),
+        _solid(ball(0.085), (0.91, -0.19, -0.02), blotches(C.sand, C.white, 0.2, 2)),
+        _solid(ball(0.085), (0.91, 0.19, -0.02), blotches(C.sand, C.orange, 0.2, 3)),
         *wheels,
-        _solid(Box((0.52, 0.03, 0.14)), (-0.37, 0.34, -0.14), checker(C.wood, C.oak, (0.35, 0.3, 0.3))),
-        _solid(Box((0.52, 0.03, 0.14)), (-0.37, -0.34, -0.14), checker(C.sand, C.moss, (0.35, 0.3, 0.3))),
-        _solid(Sphere(0.31), (-0.1, 0.03, 0.04), checker(C.teal, C.cream, 0.36)),
-        _solid(Box((0.2, 0.18, 0.2)), (-0.6, -0.1, -0.05), blotches(C.leaf, C.moss, 0.3, 4), yaw=25),
-        _solid(Cylinder(0.13, 0.2), (-0.63, -0.08, 0.35), stripes(C.plum, C.rose, (1, 0, 2), 0.22)),
+        _solid(box((0.52, 0.03, 0.14)), (-0.37, 0.34, -0.14), checker(C.wood, C.oak, (0.35, 0.3, 0.3))),
+        _solid(box((0.52, 0.03, 0.14)), (-0.37, -0.34, -0.14), checker(C.sand, C.moss, (0.35, 0.3, 0.3))),
+        _solid(ball(0.31), (-0.1, 0.03, 0.04), checker(C.teal, C.cream, 0.36)),
+        _solid(box((0.2, 0.18, 0.2)), (-0.6, -0.1, -0.05), blotches(C.leaf, C.moss, 0.3, 4), yaw=25),
+        _solid(cylinder(0.13, 0.2), (-0.63, -0.08, 0.35), stripes(C.plum, C.rose, (1, 0, 2), 0.22)),
         _solid(
-            Cylinder(0.1, 0.27),
+            cylinder(0.1, 0.27),
             (-0.5, 0.22, -0.16),
             stripes(C.orange, C.cream, (0, 1, 1), 0.2),
             roll=90,
@@ -111,12 +111,12 @@ def _furniture() -> list[Primitive]:
         )
     )
     legs = [
-        _solid(Cylinder(0.035, 0.34), (x, y, 0.34), stripes(C.oak, C.sand, (0, 0, 1), 0.3, phase=x))
+        _solid(cylinder(0.035, 0.34), (x, y, 0.34), stripes(C.oak, C.sand, (0, 0, 1), 0.3, phase=x))
         for x in (0.65, 1.35)
         for y in (-0.85, -0.35)
     ]
     boards = [
-        _solid(Box((0.16, 0.6, 0.02)), (-1.84, -0.6, z), stripes(C.wood, C.oak, (0, 1, 0), 0.4))
+        _solid(box((0.16, 0.6, 0.02)), (-1.84, -0.6, z), stripes(C.wood, C.oak, (0, 1, 0), 0.4))
         for z in (0.4, 0.85, 1.3)
     ]
     books = []
@@ -132,22 +132,22 @@ def _furniture() -> list[Primitive]:
     for i, (first, second) in enumerate(paints):
         tall, board, position = 0.13 + 0.015 * (3 * i % 5), (0.4, 0.85, 1.3)[i % 3], -1.05 + 0.14 * i
         paint = stripes(first, second, (0, 0.3, 1), 0.22, phase=float(i))
-        books.append(_solid(Box((0.12, 0.07, tall)), (-1.85, position, board + 0.02 + tall), paint))
+        books.append(_solid(box((0.12, 0.07, tall)), (-1.85, position, board + 0.02 + tall), paint))
     return [
-        _solid(Box((2.0, 1.5, 1.25)), (0, 0, 1.25), walls),
-        _solid(Cylinder(0.75, 0.012), (0.25, -0.1, 0.0), blotches(C.red, C.navy, 0.5, 13)),
+        _solid(box((2.0, 1.5, 1.25)), (0, 0, 1.25), walls),
+        _solid(cylinder(0.75, 0.012), (0.25, -0.1, 0.0), blotches(C.red, C.navy, 0.5, 13)),
         *legs,
-        _solid(Box((0.48, 0.36, 0.03)), (1.0, -0.6, 0.7), stripes(C.wood, C.sand, (0.2, 1, 0), 0.28)),
-        _solid(Sphere(0.13), (1.2, -0.5, 0.86), checker(C.orange, C.cream, 0.2)),
-        _solid(Box((0.12, 0.09, 0.07)), (0.8, -0.7, 0.8), blotches(C.plum, C.sky, 0.2, 14), yaw=30),
-        _solid(Box((0.22, 0.22, 0.22)), (0.3, -0.75, 0.22), checker(C.blue, C.cream, 0.3), yaw=20),
-        _solid(Box((0.8, 0.36, 0.2)), (-0.7, 1.12, 0.2), blotches(C.blue, C.navy, 0.4, 15)),
-        _solid(Box((0.8, 0.1, 0.42)), (-0.7, 1.38, 0.42), blotches(C.blue, C.teal, 0.4, 16)),
-        _solid(Box((0.1, 0.38, 0.3)), (-1.5, 1.1, 0.3), blotches(C.blue, C.navy, 0.35, 17)),
-        _solid(Box((0.1, 0.38, 0.3)), (0.1, 1.1, 0.3), blotches(C.blue, C.plum, 0.35, 18)),
-        _solid(Box((0.19, 0.07, 0.19)), (-1.15, 1.15, 0.58), checker(C.sand, C.red, 0.22), roll=-20, yaw=12),
+        _solid(box((0.48, 0.36, 0.03)), (1.0, -0.6, 0.7), stripes(C.wood, C.sand, (0.2, 1, 0), 0.28)),
+        _solid(ball(0.13), (1.2, -0.5, 0.86), checker(C.orange, C.cream, 0.2)),
+        _solid(box((0.12, 0.09, 0.07)), (0.8, -0.7, 0.8), blotches(C.plum, C.sky, 0.2, 14), yaw=30),
+        _solid(box((0.22, 0.22, 0.22)), (0.3, -0.75, 0.22), checker(C.blue, C.cream, 0.3), yaw=20),
+        _solid(box((0.8, 0.36, 0.2)), (-0.7, 1.12, 0.2), blotches(C.blue, C.navy, 0.4, 15)),
+        _solid(box((0.8, 0.1, 0.42)), (-0.7, 1.38, 0.42), blotches(C.blue, C.teal, 0.4, 16)),
+        _solid(box((0.1, 0.38, 0.3)), (-1.5, 1.1, 0.3), blotches(C.blue, C.navy, 0.35, 17)),
+        _solid(box((0.1, 0.38, 0.3)), (0.1, 1.1, 0.3), blotches(C.blue, C.plum, 0.35, 18)),
+        _solid(box((0.19, 0.07, 0.19)), (-1.15, 1.15, 0.58), checker(C.sand, C.red, 0.22), roll=-20, yaw=12),
         _solid(
-            Box((0.19, 0.07, 0.19)),
+            box((0.19, 0.07, 0.19)),
             (-0.3, 1.15, 0.58),
             stripes(C.rose, C.cream, (1, 0, 1), 0.16),
             roll=-20,
@@ -155,19 +155,19 @@ def _furniture() -> list[Primitive]:
         ),
         *boards,
         *books,
-        _solid(Sphere(0.12), (-1.84, -0.25, 1.44), checker(C.sky, C.leaf, 0.2)),
-        _solid(Box((0.02, 0.45, 0.35)), (1.99, 0.35, 1.5), blotches(C.sky, C.white, 0.45, 19)),
-        _solid(Box((0.01, 0.51, 0.41)), (1.99, 0.35, 1.5), stripes(C.oak, C.wood, (0, 1, 1), 0.4)),
-        _solid(Box((0.4, 0.02, 0.28)), (-0.6, 1.49, 1.55), blotches(C.orange, C.plum, 0.35, 20)),
-        _solid(Box((0.22, 0.02, 0.3)), (0.55, 1.49, 1.45), checker(C.navy, C.sand, 0.3)),
-        _solid(Box((0.3, 0.02, 0.3)), (-0.7, -1.49, 1.5), blotches(C.red, C.cream, 0.3, 21), pitch=45),
-        _solid(Box((0.5, 0.02, 0.25)), (0.9, -1.49, 1.6), stripes(C.teal, C.navy, (1, 0, 2), 0.3)),
-        _solid(Cylinder(0.16, 0.17), (1.65, 1.1, 0.17), stripes(C.orange, C.red, (1, 1, 1), 0.25)),
-        _solid(Sphere(0.3), (1.62, 1.1, 0.62), blotches(C.moss, C.leaf, 0.22, 22)),
-        _solid(Sphere(0.2), (1.5, 0.95, 0.95), blotches(C.leaf, C.moss, 0.2, 23)),
-        _solid(Cylinder(0.02, 0.75), (0.75, 1.25, 0.75), stripes(C.slate, C.cream, (0, 0, 1), 0.3)),
-        _solid(Cylinder(0.2, 0.16), (0.75, 1.25, 1.55), stripes(C.sand, C.cream, (1, 0, 1), 0.2)),
-        _solid(Sphere(0.17), (0.2, 0.3, 2.2), checker(C.cream, C.orange, 0.24)),
+        _solid(ball(0.12), (-1.84, -0.25, 1.44), checker(C.sky, C.leaf, 0.2)),
+        _solid(box((0.02, 0.45, 0.35)), (1.99, 0.35, 1.5), blotches(C.sky, C.white, 0.45, 19)),
+        _solid(box((0.01, 0.51, 0.41)), (1.99, 0.35, 1.5), stripes(C.oak, C.wood, (0, 1, 1), 0.4)),
+        _solid(box((0.4, 0.02, 0.28)), (-0.6, 1.49, 1.55), blotches(C.orange, C.plum, 0.35, 20)),
+        _solid(box((0.22, 0.02, 0.3)), (0.55, 1.49, 1.45), checker(C.navy, C.sand, 0.3)),
+        _solid(box((0.3, 0.02, 0.3)), (-0.7, -1.49, 1.5), blotches(C.red, C.cream, 0.3, 21), pitch=45),
+        _solid(box((0.5, 0.02, 0.25)), (0.9, -1.49, 1.6), stripes(C.teal, C.navy, (1, 0, 2), 0.3)),
+        _solid(cylinder(0.16, 0.17), (1.65, 1.1, 0.17), stripes(C.orange, C.red, (1, 1, 1), 0.25)),
+        _solid(ball(0.3), (1.62, 1.1, 0.62), blotches(C.moss, C.leaf, 0.22, 22)),
+        _solid(ball(0.2), (1.5, 0.95, 0.95), blotches(C.leaf, C.moss, 0.2, 23)),
+        _solid(cylinder(0.02, 0.75), (0.75, 1.25, 0.75), stripes(C.slate, C.cream, (0, 0, 1), 0.3)),
+        _solid(cylinder(0.2, 0.16), (0.75, 1.25, 1.55), stripes(C.sand, C.cream, (1, 0, 1), 0.2)),
+        _solid(ball(0.17), (0.2, 0.3, 2.2), checker(C.cream, C.orange, 0.24)),
     ]
 
 

@@ -16,7 +16,7 @@ from torch import Generator, Tensor
 
 import baked
 from balls import HomogeneousBall
-from bidnerf.scenes import Box, Sphere, blotches, orbit
+from bidnerf.scenes import ball, blotches, box, orbit
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.fields import FieldValues, SceneBounds, VoxelGrid
 from bidnerf_core.frames import View
@@ -35,7 +35,7 @@ from bidnerf_core.progress import job_context
 from optional import require
 
 RADIUS = 0.6
-BALL = baked.one_solid(Sphere(RADIUS), blotches((0.9, 0.2, 0.1), (0.1, 0.3, 0.8), 0.5, 1))
+BALL = baked.one_solid(ball(RADIUS), blotches((0.9, 0.2, 0.1), (0.1, 0.3, 0.8), 0.5, 1))
 
 
 def ball_views(count: int = 12) -> list[View]:
@@ -68,7 +68,7 @@ def test_all_that_was_seen_is_there() -> None:
 
 def test_colours_are_those_of_the_scene() -> None:
     blue = torch.tensor([0.2, 0.4, 0.8])
-    scene = baked.one_solid(Box((0.5, 0.5, 0.5)), lambda points, normals: blue.expand(len(points), 3))
+    scene = baked.one_solid(box((0.5, 0.5, 0.5)), lambda points, normals: blue.expand(len(points), 3))
     surface = measured(baked.images(replace(scene, contrast=0.0), 8, seed=0))
     assert torch.allclose(surface.surfels.rgb, blue, atol=1e-5)
 
@@ -139,7 +139,7 @@ def test_views_that_contradict_each_other_have_no_surface() -> None:
         measured(spoilt, agreement=3, cells=4_000_000)
 
 
-SCENE = baked.one_solid(Box((0.6, 0.6, 0.6)), blotches((0.9, 0.2, 0.1), (0.1, 0.3, 0.8), 0.5, 1))
+SCENE = baked.one_solid(box((0.6, 0.6, 0.6)), blotches((0.9, 0.2, 0.1), (0.1, 0.3, 0.8), 0.5, 1))
 
 
 def images(noise: float, generator: Generator, count: int = 16) -> list[PosedDepthImage]:

@@ -7,7 +7,7 @@ import torch
 from torch import Generator, Tensor
 
 import baked
-from bidnerf.scenes import Box, Primitive, Shape, Sphere, blotches
+from bidnerf.scenes import Primitive, Shape, ball, blotches, box
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import SurfaceMap, cast, trace
 
@@ -91,7 +91,7 @@ def towards(targets: Tensor, generator: Generator) -> tuple[Tensor, Tensor]:
     return origins, torch.nn.functional.normalize(targets - origins, dim=-1)
 
 
-@pytest.mark.parametrize("shape", [Sphere(0.6), Box((0.5, 0.4, 0.6))], ids=["sphere", "box"])
+@pytest.mark.parametrize("shape", [ball(0.6), box((0.5, 0.4, 0.6))], ids=["sphere", "box"])
 def test_half_lines_meet_the_surface_where_the_solid_is(shape: Shape, generator: Generator) -> None:
     surface, truth = solid(shape)
     origins, directions = towards(0.6 * torch.rand((400, 3), generator=generator) - 0.3, generator)
@@ -102,7 +102,7 @@ def test_half_lines_meet_the_surface_where_the_solid_is(shape: Shape, generator:
 
 
 def test_half_lines_that_miss_meet_nothing(generator: Generator) -> None:
-    surface, _ = solid(Sphere(0.4))
+    surface, _ = solid(ball(0.4))
     origins, directions = towards(torch.zeros((50, 3)), generator)
     assert trace(surface, origins, -directions).isinf().all()  # behind
     across = torch.nn.functional.normalize(torch.linalg.cross(directions, origins.flip(-1)), dim=-1)

@@ -3,30 +3,37 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
+from typing import TypeAlias
 
 import pytest
 import torch
 from scipy.optimize import brentq
 from torch import Tensor
 
-from bidnerf.scenes import Box, Primitive, Shape, Sphere, blotches
+from bidnerf.scenes import Primitive, Shape, ball, blotches, box
 
 # Inside: a solid and two textures that only the scenes for demonstrations use
-from bidnerf.scenes.primitives import Cylinder, checker, stripes
+from bidnerf.scenes.primitives import checker, cylinder, stripes
 from bidnerf_core.geometry import SE3
 
 PAINT = checker((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.5)
-SHAPES = [Sphere(0.7), Box((0.3, 0.6, 0.5)), Cylinder(0.5, 0.4), Cylinder(0.8, 0.01)]
+Implicit: TypeAlias = Callable[[Tensor], Tensor]
+"""A function that is negative inside a solid and positive outside."""
 
 
-def implicit(shape: Shape, points: Tensor) -> Tensor:
-    """Negative inside, positive outside."""
-    if isinstance(shape, Sphere):
-        return points.norm(dim=-1) - shape.radius
-    if isinstance(shape, Box):
-        return (points.abs() - points.new_tensor(shape.half)).amax(-1)
-    assert isinstance(shape, Cylinder)
-    return torch.maximum(points[..., :2].norm(dim=-1) - shape.radius, points[..., 2].abs() - shape.half)
+def implicit_cylinder(points: Tensor, radius: float, half: float) -> Tensor:
+    return torch.maximum(points[..., :2].norm(dim=-1) - radius, points[..., 2].abs() - half)
+
+
+SOLIDS: dict[str, tuple[Shape, Implicit]] = {
+    "ball": (ball(0.7), lambda points: points.norm(dim=-1) - 0.7),
+    "box": (box((0.3, 0.6, 0.5)), lambda points: (points.abs() - points.new_tensor([0.3, 0.6, 0.5])).amax(-1)),
+    "cylinder": (cylinder(0.5, 0.4), partial(implicit_cylinder, radius=0.5, half=0.4)),
+    "disc": (cylinder(0.8, 0.01), partial(implicit_cylinder, radius=0.8, half=0.01)),
+}
+each_solid = pytest.mark.parametrize(("shape", "implicit"), SOLIDS.values(), ids=SOLIDS)
 
 
 def random_rays(count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -42,8 +49,10 @@ def placed(shape: Shape, generator: torch.Generator) -> Primitive:
     return Primitive(shape, SE3.exp(torch.randn(6, generator=generator, dtype=torch.float64) * 0.5), PAINT)
 
 
-@pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_distance_is_the_first_crossing_of_the_implicit_surface(shape: Shape, generator: torch.Generator) -> None:
+@each_solid
+def test_distance_is_the_first_crossing_of_the_implicit_surface(
+    shape: Shape, implicit: Implicit, generator: torch.Generator
+) -> None:
     primitive = placed(shape, generator)
     origins, directions = random_rays(300, generator)
     distance = primitive.distance(origins.T, directions.T)
@@ -51,7 +60,7 @@ def test_distance_is_the_first_crossing_of_the_implicit_surface(shape: Shape, ge
 
     def level(ray: int, along: Tensor) -> Tensor:
         points = origins[ray] + along[..., None] * directions[ray]
-        return implicit(shape, primitive.T_world_shape.inverse().apply(points))
+        return implicit(primitive.T_world_shape.inverse().apply(points))
 
     compared = 0
     for ray in range(len(origins)):
@@ -70,7 +79,7 @@ def test_distance_is_the_first_crossing_of_the_implicit_surface(shape: Shape, ge
     assert compared > 25
 
 
-@pytest.mark.parametrize("shape", SHAPES, ids=str)
+@pytest.mark.parametrize("shape", [shape for shape, _ in SOLIDS.values()], ids=SOLIDS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_distance_is_never_negative_or_nan(shape: Shape, dtype: torch.dtype, generator: torch.Generator) -> None:
     for primitive in (placed(shape, generator), Primitive(shape, SE3.identity(), PAINT)):
@@ -81,15 +90,17 @@ def test_distance_is_never_negative_or_nan(shape: Shape, dtype: torch.dtype, gen
         assert distance.isfinite().all() == (primitive.T_world_shape.translation == 0).all()  # left from within
 
 
-@pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_normals_are_the_gradient_of_the_implicit_function(shape: Shape, generator: torch.Generator) -> None:
+@each_solid
+def test_normals_are_the_gradient_of_the_implicit_function(
+    shape: Shape, implicit: Implicit, generator: torch.Generator
+) -> None:
     primitive = placed(shape, generator)
     origins, directions = random_rays(900, generator)
     distance = primitive.distance(origins.T, directions.T)
     hit = distance.isfinite()
     points = (origins + distance[:, None].nan_to_num(posinf=0) * directions)[hit].requires_grad_()
     local = primitive.T_world_shape.inverse().apply(points)
-    (gradient,) = torch.autograd.grad(implicit(shape, local).sum(), points)
+    (gradient,) = torch.autograd.grad(implicit(local).sum(), points)
     paint, normals = primitive.surface(points.detach().T)
     assert len(points) > 25
     torch.testing.assert_close(normals, gradient, atol=1e-9, rtol=0)

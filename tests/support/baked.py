@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from bidnerf.scenes import (
-    Box,
     ClosedFormScene,
     GaussianBlobs,
     Primitive,
     Shape,
     Texture,
     blotches,
+    box,
     demo_object,
     orbit,
 )
@@ -65,7 +65,7 @@ def even_box() -> ClosedFormScene:
     def both(points: Tensor, normals: Tensor) -> Tensor:
         return (paint(points, normals) + paint(points * turn, normals * turn)) / 2
 
-    return replace(one_solid(Box((0.6, 0.4, 0.3)), both), contrast=0.0)
+    return replace(one_solid(box((0.6, 0.4, 0.3)), both), contrast=0.0)
 
 
 def problem(*views: View, start: SE3 | None = None, surface: SurfaceMap | None = None) -> Problem:
