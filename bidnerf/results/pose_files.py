@@ -82,15 +82,11 @@ class PosedImage:
             orientation = UPRIGHT if self.file is None else read_exif(self.file).orientation
         if orientation == UPRIGHT:
             return self
-        # The columns are the stored image's axes in the upright camera's frame.
-        x_flips, y_flips = orientation.mirrors_columns, orientation.mirrors_rows
-        x, y = (-1.0 if flips else 1.0 for flips in (x_flips, y_flips))
-        axes = [[0.0, y, 0.0], [x, 0.0, 0.0]] if orientation.transposes else [[x, 0.0, 0.0], [0.0, y, 0.0]]
-        turn = torch.tensor([*axes, [0.0, 0.0, 1.0]], dtype=torch.float64)
-        if float(torch.linalg.det(turn)) < 0:
+        if float(torch.linalg.det(orientation.axes)) < 0:
             raise InputError("is stored mirrored, which this format cannot describe", where=self.file)
-        inverse = Orientation(y_flips, x_flips, True) if orientation.transposes else Orientation(x_flips, y_flips)
-        T_upright_stored = SE3(turn, torch.zeros(3, dtype=torch.float64))
+        x_flips, y_flips = orientation.mirrors_columns, orientation.mirrors_rows
+        inverse = Orientation(y_flips, x_flips, True) if orientation.transposes else orientation
+        T_upright_stored = SE3(orientation.axes, torch.zeros(3, dtype=torch.float64))
         stored, matches = self.intrinsics.upright(inverse), self.matches
         if matches is not None:
             rays = T_upright_stored.inverse().rotate(self.intrinsics.unproject(matches.pixels))

@@ -69,24 +69,14 @@ def turn_upright(model: Any, photos: Mapping[int, ListedPhoto], pycolmap: Any) -
     for number in model.reg_image_ids():
         image = model.image(number)
         R_world_camera = image.cam_from_world().inverse().rotation.matrix()
-        right, above = _upright_axes(photos[number])
-        upright = np.stack([right, -above, np.cross(right, -above)], axis=1)
-        rotations.append(R_world_camera @ upright)
+        right, down, _ = photos[number].exif.orientation.axes.numpy()
+        rotations.append(R_world_camera @ np.stack([right, down, np.cross(right, down)], axis=1))
         centres.append(image.projection_center())
     poses = SE3(torch.from_numpy(np.stack(rotations)), torch.from_numpy(np.stack(centres)))
     rotation, _ = Rotation.align_vectors([[0, 0, 1]], [up_direction(poses).direction])
     R = rotation.as_matrix()
     centre = np.mean(centres, axis=0)
     model.transform(pycolmap.Sim3d(np.concatenate([R, -(R @ centre)[:, None]], axis=1)))
-
-
-def _upright_axes(photo: ListedPhoto) -> tuple[np.ndarray, np.ndarray]:
-    """Return the right and up axes of the upright photo in the camera frame of the photo as stored (x right, y down)."""
-    turned = photo.exif.orientation
-    x, y = (-1.0 if flips else 1.0 for flips in (turned.mirrors_columns, turned.mirrors_rows))
-    if turned.transposes:
-        return np.array([0.0, y, 0.0]), np.array([-x, 0.0, 0.0])
-    return np.array([x, 0.0, 0.0]), np.array([0.0, -y, 0.0])
 
 
 def restore_size(model: Any, photos: Mapping[int, ListedPhoto]) -> None:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from jaxtyping import Shaped
+import torch
+from jaxtyping import Float, Shaped
 from PIL.ExifTags import IFD, Base
 from torch import Tensor
 
@@ -32,6 +33,16 @@ class Orientation:
         axes = [axis for axis, flips in ((0, self.mirrors_rows), (1, self.mirrors_columns)) if flips]
         turned = image.flip(axes) if axes else image
         return turned.transpose(0, 1).contiguous() if self.transposes else turned
+
+    @property
+    def axes(self) -> Float[Tensor, "3 3"]:
+        """The axes of the upright camera, by rows, in the frame of the camera of the stored image (x right, y down).
+
+        It is the rotation ``R_upright_stored``, but its determinant is -1 for an image that is stored mirrored.
+        """
+        flips = torch.tensor([-1.0 if flips else 1.0 for flips in (self.mirrors_columns, self.mirrors_rows, False)])
+        axes = torch.diag(flips.double())
+        return axes[[1, 0, 2]] if self.transposes else axes
 
     def upright_size(self, width: int, height: int) -> tuple[int, int]:
         """Return the width and height of the upright image for a stored image of this size."""

@@ -61,6 +61,7 @@ def test_a_camera_sees_each_pixel_in_the_same_direction_up_to_the_turn(code: int
     pixels = stored.pixel_centres(torch.float64).reshape(-1, 2)
     there = landing(code)
     turn = torch.linalg.lstsq(pixels - pixels.mean(0), there - there.mean(0)).solution
+    torch.testing.assert_close(Orientation.from_exif(code).axes[:2, :2], turn.mT, atol=1e-9, rtol=0)
     expected = stored.unproject(pixels)[:, :2] @ turn
     torch.testing.assert_close(upright.unproject(there)[:, :2], expected, atol=1e-9, rtol=0)
     assert (upright.width, upright.height) == Orientation.from_exif(code).upright_size(WIDTH, HEIGHT)

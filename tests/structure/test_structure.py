@@ -369,30 +369,6 @@ def test_a_camera_that_only_turns_is_refused_though_its_focal_length_is_unknown(
         bn.find_poses(tmp_path / "photos", tmp_path / "poses")
 
 
-def test_upright_axes_are_those_of_the_turned_image(tmp_path: Path) -> None:
-    """The brightest corner of the upright image lies where its axes say, for all eight orientations."""
-    from bidnerf.structure.model import _upright_axes
-
-    stored = torch.zeros(4, 6)
-    for code in range(1, 9):
-        orientation = bn_photo(tmp_path, code).exif.orientation
-        for axis, pixel in zip(_upright_axes(bn_photo(tmp_path, code)), ((0, -1), (0, 0)), strict=True):
-            image = stored.clone()
-            v, u = (int(size - 1 if part > 0 else 0) for size, part in zip((4, 6), (axis[1], axis[0]), strict=True))
-            if axis[0]:
-                image[:, u] = 1
-            else:
-                image[v] = 1
-            upright = orientation.upright(image)
-            line = upright[:, pixel[1]] if pixel == (0, -1) else upright[0]
-            assert bool((line == 1).all()), code
-
-
-def bn_photo(folder: Path, code: int):  # type: ignore[no-untyped-def]
-    file = write_photo(folder / f"{code}.jpg", np.zeros((4, 6, 3), np.uint8), code)
-    return list_photos(Capture(folder, [Shot(image=file)]), None).photos[0]
-
-
 def test_many_photos_are_matched_with_neighbours_and_those_that_look_alike() -> None:
     generator = np.random.default_rng(0)
     count = 60
