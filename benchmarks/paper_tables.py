@@ -59,9 +59,8 @@ from bidnerf.evaluation import (
     run_trials,
     steps_of,
 )
-from bidnerf.scenes import ClosedFormData
 from bidnerf_core.errors import Cancelled, InputError
-from bidnerf_core.geometry import SE3, rotate_about
+from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import METHODS
 from bidnerf_core.progress import job_context
 
@@ -139,6 +138,16 @@ PROTOCOLS["parallel"] = Protocol(
 )
 
 
+def rotate_about(
+    T_world_camera: SE3, middle: Float[torch.Tensor, "3"], up: Float[torch.Tensor, "3"], angle_deg: float
+) -> SE3:
+    """Return the camera's pose after a rotation by ``angle_deg`` about the axis ``up`` through ``middle`` (metres, world)."""
+    phi = math.radians(angle_deg) * torch.nn.functional.normalize(up, dim=0)
+    turn = SE3.exp(torch.cat([torch.zeros_like(phi), phi]))
+    moved = T_world_camera.translation - middle
+    return SE3(turn.rotation @ T_world_camera.rotation, turn.rotate(moved) + middle)
+
+
 def arc(poses: Sequence[SE3], last: int, count: int, angle_deg: float) -> tuple[int, ...] | None:
     """Return the indices of ``count`` frames ending with ``last``, ``angle_deg`` apart about a common centre (BID-NeRF, Table 2).
 
@@ -174,8 +183,6 @@ def rigs_on_arcs(plan: Plan, scene: Scene, count: int, angle_deg: float) -> dict
     dataset = open_scene(*scene, plan)[1]
     poses = {view.frame.name: view.T_ref_camera for view in dataset.views(plan.images.split)}
     ending, names = plan.frames or tuple(poses), list(poses)
-    if isinstance(dataset, ClosedFormData):
-        return {name: dataset.sequence(name, count, angle_deg) for name in ending}
     arcs = {name: arc([*poses.values()], names.index(name), count, angle_deg) for name in ending}
     if not any(arcs.values()):
         raise InputError(f"no frame ends {count} frames {angle_deg:g} degrees apart about a centre", where=scene[1])

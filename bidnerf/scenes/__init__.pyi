@@ -2,7 +2,6 @@ from .closed_form import ClosedFormScene as ClosedFormScene
 from .closed_form import look_around as look_around
 from .closed_form import orbit as orbit
 from .closed_form import views as views
-from .closed_form_data import ClosedFormData as ClosedFormData
 from .closed_form_data import closed_form_data as closed_form_data
 from .closed_form_data import closed_form_map as closed_form_map
 from .closed_form_data import is_closed_form as is_closed_form

@@ -7,9 +7,8 @@ exact depth, as datasets for training maps and localizing in them.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from bidnerf_core.datasets import Capture, Shot
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SceneBounds, render_image
 from bidnerf_core.frames import BLACK, Frame
-from bidnerf_core.geometry import SE3, rotate_about
+from bidnerf_core.geometry import SE3
 from bidnerf_core.maps import Map, MapInfo
 
 PREFIX = "demo:"
@@ -46,49 +45,18 @@ class RenderedShot(Shot):
         return frame if side is None else frame.at_most(side)
 
 
-@dataclass(frozen=True, eq=False)
-class ClosedFormData(Capture):
-    """The frames of a closed-form scene: split "test" and, if the scene has frames to train on, split "train".
-
-    Frame "0003@15" is frame 0003 rotated by 15 degrees about the ``middle`` of the scene.
-    """
-
-    middle: tuple[float, float, float] = (0.0, 0.0, 0.0)  # metres, world
-
-    def select(self, split: str, names: Sequence[str] | None = None) -> list[Shot]:
-        """Return the frames with these names, by default all frames of the split."""
-        listed = super().select(split)
-        if names is None:
-            return listed
-        by_name, selected = {shot.name: shot for shot in listed}, list[Shot]()
-        up, middle = (torch.tensor(v, dtype=torch.float64) for v in ((0.0, 0.0, 1.0), self.middle))
-        for name in names:
-            own, _, angle = name.partition("@")
-            if own not in by_name or (angle and re.fullmatch(r"-?\d+(?:\.\d+)?", angle) is None):
-                first, *_, last = by_name
-                expected = f"{first} to {last} or a name such as {first}@15"
-                raise InputError(f"no frame {name!r}", where=self.path, expected=expected)
-            pose = by_name[own].T_world_camera
-            assert pose is not None
-            selected.append(
-                replace(by_name[own], T_world_camera=rotate_about(pose, middle, up, float(angle or 0)), name=name)
-            )
-        return selected
-
-    def sequence(self, name: str, count: int, angle: float) -> tuple[str, ...]:
-        """Return the names of ``count`` frames, ``angle`` degrees apart, ending with frame ``name``."""
-        return (*(f"{name}@{k * angle:g}" for k in range(count - 1, 0, -1)), name)
-
-
 def is_closed_form(name: str) -> bool:
     """Return whether a name is that of a closed-form scene rather than a folder."""
     return name.startswith(PREFIX)
 
 
-def closed_form_data(name: str) -> ClosedFormData:
-    """Return the dataset ``demo:NAME``. Raises ``InputError`` for an unknown name."""
+def closed_form_data(name: str) -> Capture:
+    """Return the dataset ``demo:NAME``: split "test" and, if the scene has frames to train on, split "train".
+
+    Raises ``InputError`` for an unknown name.
+    """
     _check(name, ("blobs", "object", "room"), "data")
-    training, middle = list[SE3](), (0.0, 0.0, 0.0)
+    training = list[SE3]()
     if name == "demo:blobs":
         poses, render, background = orbit(3.5, FRAME_COUNT, seed=1), _render_blobs, BLOBS.background
     else:
@@ -97,14 +65,13 @@ def closed_form_data(name: str) -> ClosedFormData:
         poses, training = orbit(3.5, FRAME_COUNT, elevation=(15.0, 50.0), seed=1), orbit(3.5, 40)
         if is_room:
             poses, training = look_around(scene.bounds, FRAME_COUNT, seed=1), look_around(scene.bounds, 40)
-            middle = (0.0, 0.0, 1.25)
         render, background = partial(scene.render, DEMO_CAMERA), scene.bounds.background
     shots = [
         RenderedShot(render=render, T_world_camera=pose, splits=(split,), stem=f"{number:04d}")
         for split, group in (("train", training), ("test", poses))
         for number, pose in enumerate(group)
     ]
-    return ClosedFormData(Path(name), shots, background, middle=middle)
+    return Capture(Path(name), shots, background)
 
 
 def closed_form_map(name: str) -> Map:

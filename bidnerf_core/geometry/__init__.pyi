@@ -23,7 +23,6 @@ from .similarity import covariance_in as covariance_in
 from .similarity import fit_similarity as fit_similarity
 from .similarity import look_at as look_at
 from .similarity import rigid_pose as rigid_pose
-from .similarity import rotate_about as rotate_about
 from .similarity import scale_point as scale_point
 from .similarity import spread as spread
 from .similarity import symbol as symbol

@@ -6,7 +6,6 @@ metres and radians, along the camera's own axes.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, cast, get_args
@@ -78,16 +77,6 @@ def look_at(
         right = torch.linalg.cross(forward, forward.new_tensor([0.0, 1.0, 0.0]))
     right = torch.nn.functional.normalize(right, dim=0)
     return SE3(torch.stack([right, torch.linalg.cross(forward, right), forward], dim=-1), position)
-
-
-def rotate_about(T_world_camera: SE3, middle: Float[Tensor, "3"], up: Float[Tensor, "3"], angle_deg: float) -> SE3:
-    """Return the camera's pose after a rotation by ``angle_deg`` about the axis ``up`` through ``middle``
-    (metres, world).
-    """
-    phi = math.radians(angle_deg) * torch.nn.functional.normalize(up, dim=0)
-    turn = SE3.exp(torch.cat([torch.zeros_like(phi), phi]))
-    moved = T_world_camera.translation - middle
-    return SE3(turn.rotation @ T_world_camera.rotation, turn.rotate(moved) + middle)
 
 
 def covariance_in(
