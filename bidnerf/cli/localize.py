@@ -239,7 +239,7 @@ class Run:
                     say(f"{len(answers.accepted)} of {total} accepted{more}")
                 if is_whole and answers.world_mismatch is not None:
                     say(answers.world_mismatch)
-                is_written = out is not None and bool(answers.given if takes_all else answers.accepted)
+                is_written = out is not None and bool(answers if takes_all else answers.accepted)
                 if out is not None and is_written:
                     answers.write(out)
                     if not is_whole:

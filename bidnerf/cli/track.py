@@ -117,14 +117,14 @@ def run_track(
             track(tracker, recorded, every=frames.every, depth=not frames.no_depth, answers=path)
     finally:  # however tracking ended, the frames so far are written
         with defer_interruptions():
-            if path.given:
+            if path:
                 try:
                     path.write(out)
                 finally:
                     if plot is not None:
                         path.plot(plot, scene.surface, scene.up)
                 if run.json:
-                    for answer in path.given:
+                    for answer in path:
                         print_json(path.plain(answer))
                 else:
                     print_table([""] * 2, path.summary(time.perf_counter() - began))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -96,8 +95,8 @@ class Failure:
     reason: str
 
 
-class Answers:
-    """The answers for the images of a run, in order: photos in one map or several, or the frames of a sequence.
+class Answers(list[Answer | Failure]):
+    """The list of the answers for the images of a run: photos in one map or several, or the frames of a sequence.
 
     With several maps, each pose is in the frame of the map in which the image was localized.
     """
@@ -109,8 +108,8 @@ class Answers:
 
         Trajectories of images without times are written as if they were ``interval`` seconds apart.
         """
+        super().__init__()
         self.scene, self.is_sequence, self.interval = scene, is_sequence, interval
-        self.given: list[Answer | Failure] = []
         self.unread = 0  # frames of a sequence whose files could not be read
 
     @property
@@ -119,15 +118,6 @@ class Answers:
         scene = self.scene
         return "units" if scene is None or isinstance(scene, MapCollection) else unit_of(scene)
 
-    def __len__(self) -> int:
-        return len(self.given)
-
-    def __iter__(self) -> Iterator[Answer | Failure]:
-        return iter(self.given)
-
-    def __getitem__(self, index: int) -> Answer | Failure:
-        return self.given[index]
-
     def __repr__(self) -> str:
         """Return a one-line description."""
         return f"<Answers for {amount(len(self), 'image')}, {len(self.accepted)} accepted>"
@@ -135,11 +125,7 @@ class Answers:
     @property
     def names(self) -> list[str]:
         """The names of the images, in order."""
-        return [answer.name for answer in self.given]
-
-    def append(self, answer: Answer | Failure) -> None:
-        """Append an answer or a failure."""
-        self.given.append(answer)
+        return [answer.name for answer in self]
 
     def plain(self, answer: Answer | Failure) -> dict[str, Any]:
         """Return an answer as the JSON object printed by ``bidnerf localize --json``.
@@ -186,7 +172,7 @@ class Answers:
     @property
     def answers(self) -> list[Answer]:
         """The answers, without the failures."""
-        return [answer for answer in self.given if isinstance(answer, Answer)]
+        return [answer for answer in self if isinstance(answer, Answer)]
 
     @property
     def world_mismatch(self) -> str | None:
@@ -219,10 +205,10 @@ class Answers:
         """
         path = Path(path)
         if pose_format(path) == ".json":
-            rows = ",\n".join(json.dumps(self.plain(answer), allow_nan=False) for answer in self.given)
+            rows = ",\n".join(json.dumps(self.plain(answer), allow_nan=False) for answer in self)
             write_file(path, f"[\n{rows}\n]\n".encode())
             return
-        accepted, others = self.accepted, [each for each in self.given if not getattr(each, "accepted", False)]
+        accepted, others = self.accepted, [each for each in self if not getattr(each, "accepted", False)]
         refused = ["{frame}: {outcome} ({reason})".format_map(self.plain(each)) for each in others]
         write_poses(path, [self._posed(answer) for answer in accepted], refused)
         if refused:
@@ -258,7 +244,7 @@ class Answers:
         """
         pandas = import_extra("pandas", "pandas", "a table of answers")
         rows = []
-        for each in self.given:
+        for each in self:
             row = {k: v for k, v in self.plain(each).items() if not isinstance(v, list | dict)}
             rows.append(row)
             if isinstance(each, Failure):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
 
 from bidnerf.results import is_pose_of
 from bidnerf.viewer.pictures import JsonObject
@@ -224,38 +223,30 @@ def bar(value: float, threshold: float, at_least: bool) -> JsonObject | None:
     return {"value": min(max(0.0, value / threshold / 2), 1.0), "at_least": at_least}
 
 
-@dataclass(frozen=True)
-class EvidenceFigure:
-    """A measure of a pose, and the threshold that it is compared with."""
+def _figure(text: tuple[str, str, str], value: float, limit: float | None = None, is_least: bool = True) -> JsonObject:
+    """Return the ``name`` of a measure of a pose, its ``value`` and its ``meaning``, and the threshold that it is compared with.
 
-    name: str
-    value: str
-    threshold: str  # with "at least" or "at most"; empty for a measure without one
-    passed: bool | None  # None if there is no threshold
-    bar: JsonObject | None
-    meaning: str
-    pose: str = ""  # description of the measured pose, if it is not the pose found
-
-    @staticmethod
-    def of(
-        text: tuple[str, str, str], value: float, limit: float | None = None, is_least: bool = True
-    ) -> EvidenceFigure:
-        """Return a figure from its texts (name, format and meaning), its value and its bound."""
-        name, spec, meaning = text
-        if limit is None:
-            return EvidenceFigure(name, format(value, spec), "", None, None, meaning)
-        bound = f"{'at least' if is_least else 'at most'} {format(limit, spec)}"
-        passed = value >= limit if is_least else value <= limit
-        return EvidenceFigure(name, format(value, spec), bound, passed, bar(value, limit, is_least), meaning)
+    ``text`` holds the name, the format and the meaning. ``threshold`` begins with "at least" or "at most", and is empty for a
+    measure without a ``limit``, for which ``passed`` is None. ``pose`` describes the measured pose if it is not the pose found.
+    """
+    name, spec, meaning = text
+    figure = {"name": name, "value": format(value, spec), "meaning": meaning, "pose": ""}
+    if limit is None:
+        return figure | {"threshold": "", "passed": None, "bar": None}
+    return figure | {
+        "threshold": f"{'at least' if is_least else 'at most'} {format(limit, spec)}",
+        "passed": value >= limit if is_least else value <= limit,
+        "bar": bar(value, limit, is_least),
+    }
 
 
-def acceptance_figures(localization: Localization, record: SearchRecord | None) -> tuple[EvidenceFigure, ...]:
+def acceptance_figures(localization: Localization, record: SearchRecord | None) -> tuple[JsonObject, ...]:
     """Return the measures of the pose found and, if landmarks did not find it, of the last pose that they found; failures first."""
     measured, answer = localization.diagnostics, last_answer(record)
-    figures = list[EvidenceFigure]()
+    figures = list[JsonObject]()
     if localization.confidence is not None and not isinstance(measured, Support):
         figures.append(
-            EvidenceFigure.of(
+            _figure(
                 ("confidence", ".1%", "probability that the pose is right, from all figures together"),
                 localization.confidence,
                 ACCEPTED,
@@ -265,29 +256,27 @@ def acceptance_figures(localization: Localization, record: SearchRecord | None) 
         figures += _landmark_figures(measured)
     elif isinstance(measured, Support):
         figures += [
-            EvidenceFigure.of(WITHOUT_LANDMARKS[bound.measure], value, bound.limit, bound.is_least)
+            _figure(WITHOUT_LANDMARKS[bound.measure], value, bound.limit, bound.is_least)
             for bound, value in measured.bounds
             if bound.measure in WITHOUT_LANDMARKS
         ]
     if answer is not None and not isinstance(measured, Evidence):
         pose = name_earlier(localization, answer)
-        figures += [replace(figure, pose=pose) for figure in _landmark_figures(answer.evidence)]
-    return tuple(sorted(figures, key=lambda figure: figure.passed is not False))  # what failed comes first
+        figures += [figure | {"pose": pose} for figure in _landmark_figures(answer.evidence)]
+    return tuple(sorted(figures, key=lambda figure: figure["passed"] is not False))  # what failed comes first
 
 
-def _landmark_figures(evidence: Evidence) -> Iterator[EvidenceFigure]:
+def _landmark_figures(evidence: Evidence) -> Iterator[JsonObject]:
     bounds = {bound.measure: bound for bound, _ in evidence.bounds}
     for measure, text in MEASURES.items():
         value, bound = getattr(evidence, measure), bounds.get(measure)
         if value is None or (measure == "log10_nfa" and not evidence.searched):
             continue
         if bound is None:
-            yield EvidenceFigure.of(text, value)
+            yield _figure(text, value)
         elif measure == "log10_nfa":
             chance, limit = (10.0 ** min(max(power, -300), 300) for power in (value, bound.limit))
-            yield replace(
-                EvidenceFigure.of(text, chance, limit, bound.is_least),
-                bar=bar(bound.limit / min(value, -0.01), 1.0, False),
-            )
+            figure = _figure(text, chance, limit, bound.is_least)
+            yield figure | {"bar": bar(bound.limit / min(value, -0.01), 1.0, False)}
         else:
-            yield EvidenceFigure.of(text, value, bound.limit, bound.is_least)
+            yield _figure(text, value, bound.limit, bound.is_least)
