@@ -54,12 +54,6 @@ class MapRow(Summary):
     weights: str  # identifies the training run, see ``Map.training``
     map_bytes: int  # size of the map's description and weights
 
-    @classmethod
-    def of(cls, label: str, size: int, results: Sequence[TrialResult]) -> MapRow:
-        """Return the statistics of trials on one map of ``size`` bytes."""
-        first, statistics = results[0], vars(summarize(results))
-        return cls(map=label, backend=first.backend, weights=first.weights, map_bytes=size, **statistics)
-
     def cells(self) -> dict[str, str]:
         """Return the statistics as text, by name."""
         usual = self.success[RELATIVE] or self.success[ABSOLUTE]
@@ -186,7 +180,16 @@ def compare(
                     " 'if __name__ == \"__main__\"'?",
                 ) from error
             report_progress(Progress("comparison", number, len(turns), "trials", f"{trial.frame} in {name}"))
-    rows = tuple(MapRow.of(name, map_bytes(source), results[name]) for name, source in sources.items())
+    rows = [
+        MapRow(
+            map=name,
+            backend=results[name][0].backend,
+            weights=results[name][0].weights,
+            map_bytes=map_bytes(source),
+            **vars(summarize(results[name])),
+        )
+        for name, source in sources.items()
+    ]
     first = next(iter(results.values()))[0]
     return Comparison(
         first.trial.data,
@@ -197,7 +200,7 @@ def compare(
         first.settings,
         first.seed,
         len(starts),
-        rows,
+        tuple(rows),
         tuple(map(tuple, results.values())),
     )
 

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -49,37 +49,30 @@ BOUND: dict[str, Any] = {"color": "#999", "linewidth": 0.8, "linestyle": (0, (4,
 """The line style of a bound."""
 
 
-class Quantity(NamedTuple):
-    """A quantity of trials that a panel shows.
-
-    Its fields are the axis label of the quantity, the axis label of the share of trials, the bound for right
-    answers (None: no bound), and a function that returns the value for a result and a criterion, infinite for
-    trials that never count.
-    """
-
-    label: str
-    share: str
-    bound: float | None
-    value: Callable[[TrialResult, str], float]
-
-
-QUANTITIES = {
-    "translation": Quantity(
-        "translation error ({unit})", "trials (%)", 0.05, lambda r, _: r.error.translation if r.error else NEVER
+QUANTITIES: dict[str, tuple[str, str, float | None, Callable[[TrialResult, str], float]]] = {
+    "translation": (
+        "translation error ({unit})",
+        "trials (%)",
+        0.05,
+        lambda r, _: r.error.translation if r.error else NEVER,
     ),
-    "rotation_deg": Quantity(
-        "rotation error (degrees)", "trials (%)", 5.0, lambda r, _: r.error.rotation_deg if r.error else NEVER
+    "rotation_deg": (
+        "rotation error (degrees)",
+        "trials (%)",
+        5.0,
+        lambda r, _: r.error.rotation_deg if r.error else NEVER,
     ),
-    "seconds": Quantity(
-        "time by the clock (s)", "right trials (%)", None, lambda r, _: r.seconds if is_right(r) else NEVER
-    ),
-    "steps": Quantity(
+    "seconds": ("time by the clock (s)", "right trials (%)", None, lambda r, _: r.seconds if is_right(r) else NEVER),
+    "steps": (
         "step",
         "successful trials (%)",
         None,
         lambda r, criterion: steps_of([r], criterion)[0] if applies(criterion, [r]) else NEVER,
     ),
 }
+"""The quantities of trials that a panel shows, by name: the axis label of the quantity, the axis label of the share of trials, the
+bound for right answers (None: no bound), and a function that returns the value for a result and a criterion, infinite for trials
+that never count."""
 POSE_ERRORS = ("translation", "rotation_deg")
 
 Panel = tuple[str, Callable[[Any], None]]
@@ -153,6 +146,7 @@ class Figures:
 
     def _quartiles(self, axes: Any, groups: Sequence[ResultGroup], kind: str) -> None:
         """Draw the median and the quartiles of an error after each step."""
+        label, _, bound, _ = QUANTITIES[kind]
         for group in groups:
             rows = [np.array(getattr(r.errors, kind), dtype=float) for r in group.results]
             longest = max(map(len, rows))  # if a trial ended early, its last error is repeated
@@ -163,8 +157,8 @@ class Figures:
             look = self.looks[group.label]
             axes.plot(middle, **look)
             axes.fill_between(range(longest), low, high, color=look["color"], alpha=0.14, linewidth=0)
-        axes.axhline(QUANTITIES[kind].bound, **BOUND)
-        axes.set(xlabel="step", ylabel=QUANTITIES[kind].label.format(unit=unit_of_results(groups[0].results)))
+        axes.axhline(bound, **BOUND)
+        axes.set(xlabel="step", ylabel=label.format(unit=unit_of_results(groups[0].results)))
         axes.set_xlim(left=0)
         _set_logarithmic(axes, "y")
 

@@ -183,22 +183,18 @@ def ply(columns: dict[str, Tensor], comments: list[str], faces: np.ndarray | Non
     point. Colours in [0, 1] are written as bytes, integers with 32 bits, and other numbers in their own
     precision.
     """
-    kinds, values = list[tuple[str, str]](), list[np.ndarray]()
-    stored = {"uchar": "u1", "float": "<f4", "double": "<f8", "int": "<i4"}
+    kinds, values = dict[str, str](), list[np.ndarray]()
     for names, column in columns.items():
-        table, kind = column.detach().cpu().reshape(len(column), -1), "int"
+        table = column.detach().cpu().reshape(len(column), -1).numpy()
+        kind = {"f4": "float", "f8": "double"}.get(table.dtype.str[1:], "int")
         if names == "red green blue":
-            table, kind = (table.clamp(0, 1) * 255).round(), "uchar"
-        elif table.dtype.is_floating_point:
-            kind = "double" if table.dtype == torch.float64 else "float"
-        for name, value in zip(names.split(), table.numpy().T, strict=True):
-            kinds.append((name, kind))
-            values.append(value)
-    rows = np.empty(len(values[0]), np.dtype([(name, stored[kind]) for name, kind in kinds]))
-    for (name, _), value in zip(kinds, values, strict=True):
-        rows[name] = value
+            table, kind = (table.clip(0, 1) * 255).round(), "uchar"
+        kinds |= dict.fromkeys(names.split(), kind)
+        values += list(table.T)
+    stored = {"uchar": "u1", "float": "<f4", "double": "<f8", "int": "<i4"}
+    rows = np.rec.fromarrays(values, dtype=[(name, stored[kind]) for name, kind in kinds.items()])
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
-    lines += [f"element vertex {len(rows)}", *(f"property {kind} {name}" for name, kind in kinds)]
+    lines += [f"element vertex {len(rows)}", *(f"property {kind} {name}" for name, kind in kinds.items())]
     body = rows.tobytes()
     if faces is not None:
         lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]

@@ -195,10 +195,12 @@ class BackendContract:
         recipes.check_exposure(self._backend(), self._config())
 
     def test_training_reports_and_saves(self) -> None:
-        recipes.check_reports(self._backend(), self._config().steps, self._training())
+        _, _, after, report = self._training()
+        recipes.check_reports(self._backend(), self._config().steps, report, after)
 
     def test_training_stops_and_resumes(self) -> None:
-        recipes.check_resuming(self._backend(), self._build, self._config(), self._training())
+        _, before, after, _ = self._training()
+        recipes.check_resuming(self._backend(), self._build, self._config(), before, after)
 
     # The fields that the tests build and train follow.
 
@@ -223,21 +225,21 @@ class BackendContract:
         with calling(f"{type(self._backend()).__name__}.build"):
             return self._backend().build(self._config() if config is None else config, SCENE_BOUNDS)
 
-    def _training(self) -> recipes.Training:
-        """Train on RGB-D views, once per test class, and return the result, whose field is frozen as in a loaded map."""
+    def _training(self) -> tuple[Any, dict[str, Tensor], dict[str, Tensor], recipes.Recorder]:
+        """Train on RGB-D views, once per test class. Return the field, frozen as in a loaded map, its states and the report."""
 
-        def train() -> recipes.Training:
+        def train() -> tuple[Any, dict[str, Tensor], dict[str, Tensor], recipes.Recorder]:
             field, total = self._build(), self._config().steps
             before = recipes.copy_state(field)
             report = recipes.Recorder(due={1, total // 2, total})
             with calling(f"{type(self._backend()).__name__}.train"):
                 self._backend().train(field, rgbd_views(), self._config(), report)
-            return recipes.Training(frozen(field), before, recipes.copy_state(field), report)
+            return frozen(field), before, recipes.copy_state(field), report
 
         return once(self, train)
 
     def _trained(self) -> Any:
-        return self._training().field
+        return self._training()[0]
 
     def _fields(self) -> Iterator[Any]:
         yield frozen(self._build())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -57,15 +57,6 @@ def round_trip(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     with calling("writing the tensors of a state to safetensors"):
         packed = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
         return tensors_from_bytes(tensors_to_bytes(packed))
-
-
-class Training(NamedTuple):
-    """A training run on RGB-D views whose report requested states after the first, middle and last of ``config.steps`` steps."""
-
-    field: Any
-    before: dict[str, Tensor]  # the field's state
-    after: dict[str, Tensor]
-    report: Recorder
 
 
 def copy_state(field: Any) -> dict[str, Tensor]:
@@ -123,9 +114,12 @@ def check_exposure(backend: Backend, config: Any) -> None:
     )
 
 
-def check_reports(backend: Backend, total: int, training: Training) -> None:
-    """Check that all ``total`` steps were reported in order and states saved exactly when due, the last with the trained field."""
-    due, report, who = sorted({1, total // 2, total}), training.report, f"{type(backend).__name__}.train"
+def check_reports(backend: Backend, total: int, report: Recorder, after: dict[str, Tensor]) -> None:
+    """Check that all ``total`` steps were reported in order and states saved exactly when due, the last with the trained field.
+
+    ``report`` requested states after the first, middle and last step; ``after`` is the state of the trained field.
+    """
+    due, who = sorted({1, total // 2, total}), f"{type(backend).__name__}.train"
     steps = [(progress.step, progress.total) for progress in report.steps]
     odd = [p for p in report.steps if not (math.isfinite(p.loss) and math.isfinite(p.psnr))]
     saved = [state.step for state in report.saved]
@@ -143,18 +137,23 @@ def check_reports(backend: Backend, total: int, training: Training) -> None:
     )
     _require_same(
         report.saved[-1].field,
-        training.after,
+        after,
         who,
         "the state saved after the last step is not that of the trained field",
     )
 
 
-def check_resuming(backend: Backend, make: Callable[[], Any], config: Any, whole: Training) -> None:
-    """Check that training stopped midway, by ``TrainingStopped``, and then resumed gives a bitwise identical result."""
+def check_resuming(
+    backend: Backend, make: Callable[[], Any], config: Any, before: dict[str, Tensor], after: dict[str, Tensor]
+) -> None:
+    """Check that training stopped midway, by ``TrainingStopped``, and then resumed gives a bitwise identical result.
+
+    ``before`` and ``after`` are the states of a field around an uninterrupted training.
+    """
     who, middle = f"{type(backend).__name__}.train", config.steps // 2
     second, third = make(), make()
     for field in (second, third):  # another test checks whether builds differ
-        field.load_state_dict(whole.before)
+        field.load_state_dict(before)
     report = Recorder(stop=middle)
     stop = f"report.stopping was set after step {middle}"
     try:
@@ -180,7 +179,7 @@ def check_resuming(backend: Backend, make: Callable[[], Any], config: Any, whole
     )
     _require_same(
         third.state_dict(),
-        whole.after,
+        after,
         who,
         "a resumed training arrives elsewhere than an uninterrupted one, expected the same bits; is all state in"
         " state_dict, and all randomness from the saved generator?",

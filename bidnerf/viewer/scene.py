@@ -45,7 +45,8 @@ def map_json(scene: Map, thumbnails: int = 60) -> JsonObject:
     ``unit`` is the symbol of the unit of length, ``up_source`` states how the upward direction ``up`` was found, and
     ``centre`` and ``extent`` (in the unit of the map) are those of the region that the initial view should show.
     """
-    up, (centre, extent) = scene.up, _framing(scene)
+    up, (centre, extent), landmarks = scene.up, _framing(scene), scene.landmarks
+    some = _subset(0 if landmarks is None else len(landmarks), 20_000)
     every = max(1, math.ceil(len(scene.info.cameras) / max(thumbnails, 1)))
     return {
         "name": scene.folder.resolve().name if scene.folder is not None else "map in memory",
@@ -56,7 +57,7 @@ def map_json(scene: Map, thumbnails: int = 60) -> JsonObject:
         "centre": centre,
         "extent": extent,
         "surface": _surface(scene),
-        "landmarks": _landmarks(scene),
+        "landmarks": None if landmarks is None else _points(landmarks.positions[some], len(landmarks), 0.0),
         "splats": _splats(scene),
         "cameras": [
             {
@@ -156,12 +157,6 @@ def turn_towards(
     _, nearest = cKDTree(cameras.numpy()).query(positions.numpy())
     ahead = ((cameras[torch.from_numpy(nearest)] - positions) * normals).sum(-1, keepdim=True)
     return torch.where(ahead < 0, -normals, normals)
-
-
-def _landmarks(scene: Map) -> JsonObject | None:
-    if scene.landmarks is None:
-        return None
-    return _points(scene.landmarks.positions[_subset(len(scene.landmarks), 20_000)], len(scene.landmarks), 0.0)
 
 
 def _splats(scene: Map) -> JsonObject | None:
