@@ -25,25 +25,11 @@ from bidnerf_core.frames import View
 from bidnerf_core.training import RayBank, TrainingBatch
 from optional import require
 from simulated_device import StaysOnDevice
+from small_backends import ADANERF
 from tiny import black_batch
 from trainings import assert_same_tensors
 
-SMALL = AdaNerfConfig(
-    width=32,
-    layers=2,
-    position_frequencies=4,
-    oracle_width=32,
-    oracle_layers=2,
-    ray_points=4,
-    ray_frequencies=2,
-    bins=16,
-    max_samples=5,
-    steps=60,
-    samples_per_step=4096,
-    rays_at_most=256,
-    learning_rate=0.02,
-    room_resolution=16,
-)
+SMALL = replace(ADANERF, steps=60)
 
 
 class TestAdaNerf(StaysOnDevice, BackendContract):

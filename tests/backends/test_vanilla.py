@@ -25,21 +25,9 @@ from bidnerf_vanilla import VanillaConfig, VanillaField, backend
 from bidnerf_vanilla.field import OccupiedOnly
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig
 from simulated_device import StaysOnDevice
+from small_backends import VANILLA
 
-SMALL = VanillaConfig(
-    layers=3,
-    width=32,
-    skip=1,
-    position_frequencies=4,
-    direction_frequencies=1,
-    coarse_samples=24,
-    fine_samples=8,
-    room_resolution=16,
-    steps=60,
-    samples_per_step=2048,
-    rays_at_most=256,
-    learning_rate=0.01,
-)
+SMALL = replace(VANILLA, layers=3, coarse_samples=24, steps=60)
 
 
 class TestVanilla(StaysOnDevice, BackendContract):

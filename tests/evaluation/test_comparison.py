@@ -29,7 +29,7 @@ from bidnerf.evaluation import (
 )
 from bidnerf.evaluation.comparison import MapRow, map_bytes
 from bidnerf.evaluation.run import InThisProcess, local_processes, terminate_on_failure
-from bidnerf.evaluation.summary import success_of
+from bidnerf.evaluation.summary import success_of, summarize
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.io import from_plain
 from commands import Run, assert_refused, strict
@@ -131,13 +131,13 @@ def test_a_title_counts_trials_and_starts() -> None:
 
 def test_a_median_error_counts_lost_poses_as_worst() -> None:
     good, gone = result(0.1, [1.0, 0.1]), replace(result(0.1, [1.0, 0.1]), error=None)
-    assert MapRow.of("a", 0, [good, good, gone]).translation == pytest.approx(0.01)
-    assert MapRow.of("a", 0, [good, gone, gone]).translation is None
+    assert summarize([good, good, gone]).translation == pytest.approx(0.01)
+    assert summarize([good, gone, gone]).translation is None
 
 
 def test_without_a_start_there_is_no_share_of_its_error(tmp_path: Path) -> None:
     free = replace(result(1.0, [0.04, 0.01]), start_error=None)
-    row = MapRow.of("short", 0, [free])
+    row = MapRow(map="short", backend="vanilla", weights="", map_bytes=0, **vars(summarize([free])))
     assert row.success["10%"] is None
     absolute = require(row.success["5deg 0.05"])
     assert (absolute.rate.successes, absolute.steps) == (1, 0)
