@@ -23,7 +23,7 @@ from torch.utils._pytree import tree_leaves
 from bidnerf_core.errors import InputError
 from bidnerf_core.progress import current_job
 
-T = TypeVar("T")
+Value = TypeVar("Value")
 _Rows = TypeVar("_Rows", bound="TensorRows")
 
 
@@ -149,7 +149,7 @@ def wait_for(device: torch.device) -> None:
             torch.cuda.synchronize(device)
 
 
-def run_on(device: torch.device, function: Callable[..., T], *values: Any) -> T:
+def run_on(device: torch.device, function: Callable[..., Value], *values: Any) -> Value:
     """Return ``function(*values)``, computed on ``device``, with all tensors of the result on the CPU.
 
     Tensors in ``values`` are found as ``move_to`` finds them, except that modules and ``Resident`` objects must already be
@@ -176,7 +176,7 @@ def run_on(device: torch.device, function: Callable[..., T], *values: Any) -> T:
         lane.remotes.move_to_end(key)
         while len(lane.remotes) > 128:  # functions of different shapes; the least recently used is discarded
             lane.remotes.popitem(last=False)
-        return cast(T, lane.remotes[key](tensors))
+        return cast(Value, lane.remotes[key](tensors))
     finally:
         with _sharing:
             free.append(lane)
@@ -310,7 +310,7 @@ def working_device(device: torch.device | str) -> torch.device:
     return found
 
 
-def move_to(value: T, device: torch.device | str) -> T:
+def move_to(value: Value, device: torch.device | str) -> Value:
     """Return ``value`` with every tensor in it on ``device``; ``value`` itself is not modified.
 
     Tensors are found in modules, in the fields of dataclasses, and in lists, tuples and dictionaries of
@@ -325,7 +325,7 @@ def move_to(value: T, device: torch.device | str) -> T:
         tensors = (*part.parameters(), *part.buffers())
         return part if all(_is_on(t, there) for t in tensors) else copy.deepcopy(part).to(there)
 
-    return cast(T, _map_parts(value, change, (nn.Module,)))
+    return cast(Value, _map_parts(value, change, (nn.Module,)))
 
 
 def _map_parts(value: Any, change: Callable[[Any], Any], whole: tuple[type, ...]) -> Any:
@@ -390,7 +390,7 @@ def set_threads_here(count: int) -> None:
         _in_new_thread(lambda: torch.set_num_threads(default))
 
 
-def _in_new_thread(function: Callable[[], T]) -> T:
+def _in_new_thread(function: Callable[[], Value]) -> Value:
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(function).result()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import signal
 import sys
@@ -47,11 +46,10 @@ from bidnerf_core.progress import (
     ProgressCallback,
     check_cancelled,
     job_context,
+    log,
     report_progress,
 )
 from bidnerf_core.settings import to_flat
-
-log = logging.getLogger("bidnerf")
 
 Workers: TypeAlias = int | str | None
 """A number of processes, None for one per core, or the address of a dask scheduler such as ``tcp://host:8786``."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,8 +33,7 @@ from bidnerf_core.io import write_file
 from bidnerf_core.localization import Localization, SceneMap
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.maps import MapCollection, Placement, origin_of, unit_of
-
-log = logging.getLogger("bidnerf")
+from bidnerf_core.progress import log
 
 BAD_INPUT = "bad input"
 """Outcome of an image that could not be read."""

@@ -5,7 +5,6 @@ Surface, landmarks and cameras are written as point clouds, as a COLMAP model, o
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -25,9 +24,8 @@ from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.io import output_folder, write_file
 from bidnerf_core.mapping import LandmarkMap
 from bidnerf_core.maps import Map, load_info, load_map, origin_of
+from bidnerf_core.progress import log
 from bidnerf_core.registry import Plugins, interface_defects
-
-log = logging.getLogger("bidnerf")
 
 Exporter: TypeAlias = Callable[[Map, Path], Sequence[Path]]
 """A function that writes a map, whose surface and landmarks are on the CPU, into an existing folder and returns the files.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,9 +27,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.io import looks_like_image
 from bidnerf_core.localization import Outcome, SceneMap, record_search
 from bidnerf_core.maps import Localizer, MapCollection, origin_of
-from bidnerf_core.progress import Cancel, ProgressCallback, counter, job_context
-
-log = logging.getLogger("bidnerf")
+from bidnerf_core.progress import Cancel, ProgressCallback, counter, job_context, log
 
 
 def localize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -13,9 +12,7 @@ from bidnerf_core.errors import InputError, InputWarning, amount
 from bidnerf_core.frames import Frame
 from bidnerf_core.localization import SceneMap
 from bidnerf_core.maps import Localizer, Tracker, TrackerConfig, landmark_cameras
-from bidnerf_core.progress import Cancel, ProgressCallback, counter, job_context
-
-log = logging.getLogger("bidnerf")
+from bidnerf_core.progress import Cancel, ProgressCallback, counter, job_context, log
 
 
 def track(

@@ -28,11 +28,11 @@ from bidnerf.service.web import (
     await_result,
     error_responses,
     json_request,
-    log,
     photo_request,
     problem,
     read_body,
     read_photo,
+    service_log,
 )
 from bidnerf_core.errors import InputError
 
@@ -223,4 +223,4 @@ def report_request(scope: Scope, status: int, seconds: float, error: Exception |
             "fault": f"{type(error).__name__}: {error}",
             "traceback": "".join(traceback.format_exception(error)),
         }
-    log.log(logging.ERROR if status >= 500 else logging.INFO, "%s", json.dumps(line))
+    service_log.log(logging.ERROR if status >= 500 else logging.INFO, "%s", json.dumps(line))

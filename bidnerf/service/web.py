@@ -38,7 +38,7 @@ from bidnerf.service.models import (
 from bidnerf.service.settings import MEBIBYTE, ServiceLimits
 from bidnerf_core.errors import InputError
 
-log = logging.getLogger("bidnerf.service")
+service_log = logging.getLogger("bidnerf.service")
 
 SAFE = {
     "X-Content-Type-Options": "nosniff",
@@ -76,7 +76,7 @@ FaultReport = Callable[[Scope, int, float, Exception | None], None]
 def report_fault(scope: Scope, status: int, seconds: float, error: Exception | None) -> None:
     """Log a request only if it ended with an internal error."""
     if error is not None:
-        log.error("internal error while answering %s", scope["path"][:200], exc_info=error)
+        service_log.error("internal error while answering %s", scope["path"][:200], exc_info=error)
 
 
 class Application(FastAPI):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
-import logging
 import shutil
 import time
 import warnings
@@ -57,9 +56,7 @@ from bidnerf_core.camera import UPRIGHT, Camera, CameraSource
 from bidnerf_core.datasets import Capture
 from bidnerf_core.errors import Cancelled, InputError, InputWarning, amount
 from bidnerf_core.io import output_folder, to_plain, write_file
-from bidnerf_core.progress import Cancel, ProgressCallback, job_context
-
-log = logging.getLogger("bidnerf")
+from bidnerf_core.progress import Cancel, ProgressCallback, job_context, log
 
 
 def find_poses(

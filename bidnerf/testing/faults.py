@@ -12,7 +12,7 @@ from torch import Generator, Tensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import FieldValues, RadianceField, Rays, RaySamples
 
-T = TypeVar("T")
+Made = TypeVar("Made")
 
 
 def require(who: str, *claims: tuple[object, str]) -> None:
@@ -68,7 +68,7 @@ def is_refused(call: Callable[[], object]) -> bool:
     return False
 
 
-def once(subject: object, make: Callable[[], T]) -> T:
+def once(subject: object, make: Callable[[], Made]) -> Made:
     """Return the result of ``make``, which is called only once for the test class of the instance ``subject``."""
     if "_made" not in vars(type(subject)):
         type(subject)._made = make()  # type: ignore[attr-defined]
@@ -85,7 +85,7 @@ class Named:
     def _who(self) -> str:
         return f"{self.kind} {self.name!r}"
 
-    def _part(self, load: Callable[[str], T]) -> T:
+    def _part(self, load: Callable[[str], Made]) -> Made:
         require(type(self).__name__, (self.name != "", "no name, expected the one that is registered"))
         return load(self.name)
 

@@ -49,7 +49,7 @@ from bidnerf_core.io import parse_json, to_plain
 from bidnerf_core.localization import SearchRecord
 from bidnerf_core.maps import Localizer
 
-log = logging.getLogger("bidnerf.viewer")
+viewer_log = logging.getLogger("bidnerf.viewer")
 
 SLOTS = 10
 """Maximum number of photos that are uploading, waiting or being localized."""
@@ -110,7 +110,7 @@ class ShownJob:
         except InputError as error:
             self.answer = no_answer(self.name, BAD_INPUT, str(error))
         except Exception:  # third-party code may raise anything, with paths of this machine in it
-            log.exception("internal error while localizing %s", self.name)
+            viewer_log.exception("internal error while localizing %s", self.name)
             self.answer = no_answer(
                 self.name, "fault", "the viewer failed; its log names the cause, beside the name of the image"
             )

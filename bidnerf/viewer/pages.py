@@ -6,7 +6,6 @@ import base64
 import hashlib
 import html
 import json
-import logging
 import math
 import re
 from collections.abc import Callable
@@ -27,9 +26,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.io import to_plain, write_file
 from bidnerf_core.localization import Localization, SearchRecord, record_search
 from bidnerf_core.maps import Localizer, Map
-from bidnerf_core.progress import counter
-
-log = logging.getLogger("bidnerf")
+from bidnerf_core.progress import counter, log
 
 
 @dataclass(frozen=True, eq=False)

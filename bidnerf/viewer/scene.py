@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import re
 from collections.abc import Sequence
@@ -32,8 +31,7 @@ from bidnerf_core.fields import SplatField
 from bidnerf_core.geometry import SE3, LengthUnit, pose_from_matrix, symbol
 from bidnerf_core.io import read_file
 from bidnerf_core.maps import Map
-
-log = logging.getLogger("bidnerf")
+from bidnerf_core.progress import log
 
 MOST_POINTS = 120_000
 """Maximum number of surfels or splats in a page; larger sets are subsampled at random."""

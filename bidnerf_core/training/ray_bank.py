@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,8 +15,7 @@ from bidnerf_core.devices import constant, move_to
 from bidnerf_core.fields import Observations, Rays, SceneBounds
 from bidnerf_core.frames import SPARSE, Frame, ImagePixels, View, bytes_of
 from bidnerf_core.geometry import SE3
-
-log = logging.getLogger("bidnerf")
+from bidnerf_core.progress import log
 
 MEASURED_SHARE = 0.25
 """Fraction of a batch's rays drawn from pixels with depth, if these are so few that hardly any would be drawn
