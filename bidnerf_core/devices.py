@@ -399,7 +399,7 @@ AHEAD = 64
 """Number of tasks submitted ahead of the results, which bounds the memory of what runs them."""
 
 
-def map_tasks(work: Callable[..., T], tasks: Iterable[tuple[Any, ...]]) -> Iterator[T]:
+def map_tasks(work: Callable[..., Value], tasks: Iterable[tuple[Any, ...]]) -> Iterator[Value]:
     """Yield ``work(*task)`` for each of the independent tasks, in order.
 
     The executor of this thread's job runs them (see ``job_context``), otherwise as many threads as torch uses. Other processes receive
@@ -407,7 +407,7 @@ def map_tasks(work: Callable[..., T], tasks: Iterable[tuple[Any, ...]]) -> Itera
     """
     executor = current_job().executor
     with ThreadPoolExecutor(max(1, torch.get_num_threads())) if executor is None else nullcontext(executor) as pool:
-        waiting = deque[Future[T]]()
+        waiting = deque[Future[Value]]()
         try:
             for task in tasks:
                 waiting.append(pool.submit(work, *task))
