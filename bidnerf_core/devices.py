@@ -292,6 +292,11 @@ class TensorRows:
         """Return the object with ``change`` applied to each tensor."""
         return type(self)(*(change(part) for part in vars(self).values()))
 
+    @classmethod
+    def joined(cls: type[_Rows], parts: Iterable[_Rows]) -> _Rows:
+        """Concatenate the rows of ``parts``."""
+        return cls(*map(torch.cat, zip(*(vars(part).values() for part in parts), strict=True)))
+
 
 def working_device(device: torch.device | str) -> torch.device:
     """Return the named device after a test computation on it: a valid name does not mean that the device works here.

@@ -51,7 +51,7 @@ T_COLOUR_DEPTH = SE3(
 """Pose of another Kinect's depth camera in its colour camera's frame, as used by ACE's ``setup_7scenes.py``:
 https://projet.liris.cnrs.fr/voir/activities-dataset/kinect-calibration.html."""
 
-SEQUENCE = re.compile(r"seq(?:uence)?-?0*(\d+)", re.IGNORECASE)
+SEQUENCE = re.compile(r"seq(?:uence)?-?0*(\d{1,9})", re.IGNORECASE)
 SEVEN_SCENES = Layout(
     (("seq*[0-9]",), (".",)),
     image=r"(frame-\d+)\.color\.(?:png|jpe?g)",

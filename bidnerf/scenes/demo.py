@@ -67,13 +67,14 @@ def _lorry() -> list[Primitive]:
         ((-0.5, -0.36), 0.3, C.rose),
         ((-0.5, 0.36), 0.3, C.sky),
     ]
-    wheels = []
-    for (x, y), radius, hub in tyres:
-        position = (x, y, radius - 0.85)
-        outward = math.copysign(0.1, y)
-        wheels.append(_solid(cylinder(radius, 0.1), position, checker(C.slate, C.navy, 0.24, phase=x), roll=90))
-        cap = (x, y + outward, radius - 0.85)
-        wheels.append(_solid(cylinder(0.6 * radius, 0.03), cap, blotches(hub, C.red, 0.25, round(9 * x * y)), roll=90))
+    wheels = [
+        _solid(disc, (x, y + math.copysign(outward, y), radius - 0.85), paint, roll=90)
+        for (x, y), radius, hub in tyres
+        for disc, outward, paint in (
+            (cylinder(radius, 0.1), 0.0, checker(C.slate, C.navy, 0.24, phase=x)),
+            (cylinder(0.6 * radius, 0.03), 0.1, blotches(hub, C.red, 0.25, round(9 * x * y))),
+        )
+    ]
     return [
         _solid(box((0.9, 0.36, 0.09)), (0, 0, -0.36), stripes(C.navy, C.blue, (1, 0.6, 0), 0.3)),
         _solid(box((0.24, 0.38, 0.38)), (0.44, 0, 0.1), blotches(C.red, C.orange, 0.5, 1)),

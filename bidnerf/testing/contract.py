@@ -13,9 +13,10 @@ from torch import Tensor, nn
 
 from bidnerf.testing import field_checks, recipes
 from bidnerf.testing.faults import calling, is_one_line, once, query, require
-from bidnerf.testing.scene import SCENE_BOUNDS, awkward_rays, join_rays, points, rgb_views, rgbd_views
+from bidnerf.testing.scene import SCENE_BOUNDS, awkward_rays, points, rgb_views, rgbd_views
 from bidnerf_core.backend import Backend, load_backend
-from bidnerf_core.fields import RadianceField, levels
+from bidnerf_core.devices import move_to
+from bidnerf_core.fields import RadianceField, Rays, levels
 from bidnerf_core.io import from_plain, to_plain
 from bidnerf_core.registry import interface_defects
 
@@ -125,13 +126,13 @@ class BackendContract:
     def test_field_moves_to_a_device(self) -> None:
         if not torch.cuda.is_available():
             return
-        rays = join_rays(list(awkward_rays().values()))
+        rays = Rays.joined(awkward_rays().values())
         field = self._trained()
         with calling(f"{type(field).__name__} on CUDA"):
             moved = copy.deepcopy(field).to("cuda")
-            names = (f.name for f in dataclasses.fields(rays))
-            elsewhere = dataclasses.replace(rays, **{name: getattr(rays, name).cuda() for name in names})
-            found = field_checks.render_channels(cast(RadianceField, moved), elsewhere, "rays on CUDA").cpu()
+            found = field_checks.render_channels(
+                cast(RadianceField, moved), move_to(rays, "cuda"), "rays on CUDA"
+            ).cpu()
         require(
             type(field).__name__,
             (
@@ -169,7 +170,7 @@ class BackendContract:
         with calling(f"{type(fresh).__name__}.load_state_dict of a saved state_dict"):
             fresh.load_state_dict(recipes.round_trip(dict(trained.state_dict())))
         loaded = frozen(fresh)
-        rays = join_rays(list(awkward_rays().values()))
+        rays = Rays.joined(awkward_rays().values())
         same = torch.equal(_answers(loaded), _answers(trained)) and all(
             torch.equal(field_checks.render_channels(a, rays, "rays"), field_checks.render_channels(b, rays, "rays"))
             for a, b in zip(levels(loaded), levels(trained), strict=True)

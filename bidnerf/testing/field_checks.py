@@ -15,10 +15,8 @@ from bidnerf.testing.scene import (
     awkward_points,
     awkward_rays,
     camera_rays,
-    join_rays,
     points,
     rgbd_views,
-    select_rays,
 )
 from bidnerf_core.fields import (
     DifferentiatedField,
@@ -289,12 +287,12 @@ def check_intervals(field: RadianceField) -> None:
 def _arrangements() -> Iterator[Rays]:
     """Yield batches of rays with various shapes, some of them without any rays."""
     for shape in ((), (1,), (2, 3), (0,), (2, 0)):
-        yield select_rays(awkward_rays()["rays from outside"], torch.arange(torch.Size(shape).numel()).reshape(shape))
+        yield awkward_rays()["rays from outside"][torch.arange(torch.Size(shape).numel()).reshape(shape)]
 
 
 def check_repeatable(field: RadianceField) -> None:
     """Check that samples are reproducible without jitter and, with jitter, for equal seeds of the given generator."""
-    rays = join_rays(list(awkward_rays().values()))
+    rays = Rays.joined(awkward_rays().values())
     with torch.random.fork_rng(devices=[]):
         twice = [sample(field, rays, "rays") for _ in range(2)]
         jittered = [sample(field, rays, "rays with jitter", _generator()) for _ in range(2)]
@@ -314,14 +312,12 @@ def check_repeatable(field: RadianceField) -> None:
 
 def check_rays_alone(field: RadianceField) -> None:
     """Check that the rendering of a ray depends neither on the other rays nor on their arrangement."""
-    rays = join_rays(list(awkward_rays().values()))
+    rays = Rays.joined(awkward_rays().values())
     count = len(rays.near) // 4 * 4
-    whole = render_channels(field, select_rays(rays, torch.arange(count)), "rays")
+    whole = render_channels(field, rays[:count], "rays")
     order = torch.randperm(count, generator=_generator())
-    permuted = render_channels(field, select_rays(rays, order.reshape(4, -1)), "rays in another order").reshape(-1, 5)
-    alone = torch.cat(
-        [render_channels(field, select_rays(rays, torch.arange(i, i + 1)), "a ray") for i in range(0, count, 7)]
-    )
+    permuted = render_channels(field, rays[order.reshape(4, -1)], "rays in another order").reshape(-1, 5)
+    alone = torch.cat([render_channels(field, rays[i : i + 1], "a ray") for i in range(0, count, 7)])
     expected = "expected each ray to be sampled for itself"
     require(
         f"{type(field).__name__} rendered",
@@ -354,7 +350,7 @@ def check_levels(field: RadianceField) -> None:
             type(field).__name__,
             (isinstance(level, RadianceField), f"levels[{number}] is a {type(level).__name__}, {expected}"),
         )
-    rays = join_rays(list(awkward_rays().values()))
+    rays = Rays.joined(awkward_rays().values())
     require(
         f"{type(field).__name__}.levels",
         (

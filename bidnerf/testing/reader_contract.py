@@ -157,5 +157,5 @@ class ReaderContract(Named):
             return data.views(split, data.frame_names(split)[:24])  # as many are compared with each other
 
     def _tracked(self) -> TrackedViews:
-        """Return the keypoints of the images, join_rays into tracks; computed once per test class."""
+        """Return the keypoints of the images, joined into tracks; computed once per test class."""
         return once(self, lambda: track_views(self._views()))

@@ -92,13 +92,3 @@ def awkward_rays() -> dict[str, Rays]:
         "rays that are sampled twice as far": widen(SCENE_BOUNDS.rays(outside, away), 2.0),
         "rays that miss the scene": SCENE_BOUNDS.rays(outside, -away),
     }
-
-
-def select_rays(rays: Rays, index: Tensor) -> Rays:
-    """Return the rays at the indices ``index``, arranged in the shape of ``index``."""
-    return Rays(rays.origins[index], rays.directions[index], rays.near[index], rays.far[index])
-
-
-def join_rays(parts: list[Rays]) -> Rays:
-    names = ("origins", "directions", "near", "far")
-    return Rays(*(torch.cat([getattr(part, name) for part in parts]) for name in names))

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
-from bidnerf_core.devices import constant
+from bidnerf_core.devices import TensorRows, constant
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import scale_point
 
@@ -53,7 +53,7 @@ class RaySpacing:
 
 
 @dataclass(frozen=True, eq=False)
-class Rays:
+class Rays(TensorRows):
     """Half-lines, each with the interval [near, far] that may contain matter. ``far <= near`` marks a ray that misses the scene."""
 
     origins: Float[Tensor, "*r 3"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,11 +65,6 @@ class Observations(TensorRows):
             raise InputError("nothing was measured", where="depth rays", expected="at least one finite point in front")
         coloured = torch.zeros(len(distance), dtype=torch.bool, device=distance.device)
         return Observations(origins, directions, torch.zeros_like(directions), distance, coloured)
-
-    @staticmethod
-    def joined(parts: Sequence[Observations]) -> Observations:
-        """Concatenate the rays of ``parts``, which share a reference frame, along the first axis."""
-        return Observations(*map(torch.cat, zip(*(vars(part).values() for part in parts), strict=True)))
 
     @property
     def measured(self) -> Bool[Tensor, "*p"]:
