@@ -248,8 +248,8 @@ class Answers(list[Answer | Failure]):
             if isinstance(each, Failure):
                 continue
             T, localization = each.localization.T_world_camera.to("cpu", torch.float64), each.localization
-            row |= zip(("x", "y", "z"), T.translation.tolist(), strict=True)
-            row |= zip(("qx", "qy", "qz", "qw"), T.quaternion("xyzw").tolist(), strict=True)
+            numbers = *T.translation.tolist(), *T.quaternion("xyzw").tolist()
+            row |= zip(("x", "y", "z", "qx", "qy", "qz", "qw"), numbers, strict=True)
             if localization.covariance is not None:
                 position, rotation = standard_deviations(localization.covariance)
                 row |= {"sigma_translation": position, "sigma_rotation_deg": math.degrees(rotation)}
@@ -308,26 +308,11 @@ class Answers(list[Answer | Failure]):
         total, accepted, lost = len(self), len(self.accepted), self.lost
         longest = max((last - first + 1 for first, last in lost), default=0)
         losses = f"{amount(len(lost), 'time')}, at most for {amount(longest, 'frame')}" if lost else "never"
-        rows = [
-            ("frames", f"{total}, {total / max(seconds, 1e-9):.1f} per second"),
-            ("tracked", f"{accepted} ({accepted / max(1, total):.1%})"),
-            ("not read", amount(self.unread, "frame") if self.unread else ""),
-            ("lost", losses),
-        ]
-        unit = symbol(self.unit)
-        if (errors := self.errors()) is not None:
-            rows.append(("raw error", str(errors.raw)))
-            if errors.ate is not None:
-                rows.append(("ATE", f"{errors.ate:.4f} {unit} (root mean square, rigidly aligned)"))
-            if errors.rpe is not None:
-                rows.append(("RPE per frame", str(errors.rpe)))
         inside = [
             bool(within(answer.localization.T_world_camera, answer.truth, answer.localization.covariance))
             for answer in self.accepted
             if answer.truth is not None and answer.localization.covariance is not None
         ]
-        if inside:
-            rows.append(("inside 95 % bound", f"{sum(inside) / len(inside):.1%} (by the poses' covariances)"))
         # Frames are training images of the map if their names and true poses are the same, up to rounding in files.
         info = getattr(self.scene, "info", None)
         cameras = () if info is None else given_cameras(info.cameras)
@@ -338,9 +323,20 @@ class Answers(list[Answer | Failure]):
             and torch.allclose(given[answer.name], answer.truth.matrix(), rtol=0, atol=1e-4)
             for answer in self.answers
         )
-        if seen:
-            rows.append(("trained on", f"{amount(seen, 'frame')}; errors on training frames of the map are no test"))
-        return [(name, text) for name, text in rows if text]
+        unit, errors = symbol(self.unit), self.errors()
+        ate, rpe = (None, None) if errors is None else (errors.ate, errors.rpe)
+        rows = {
+            "frames": f"{total}, {total / max(seconds, 1e-9):.1f} per second",
+            "tracked": f"{accepted} ({accepted / max(1, total):.1%})",
+            "not read": amount(self.unread, "frame") if self.unread else "",
+            "lost": losses,
+            "raw error": "" if errors is None else str(errors.raw),
+            "ATE": "" if ate is None else f"{ate:.4f} {unit} (root mean square, rigidly aligned)",
+            "RPE per frame": "" if rpe is None else str(rpe),
+            "inside 95 % bound": f"{sum(inside) / len(inside):.1%} (by the poses' covariances)" if inside else "",
+            "trained on": f"{amount(seen, 'frame')}; errors on training frames of the map are no test" if seen else "",
+        }
+        return [(name, text) for name, text in rows.items() if text]
 
 
 def plain_localization(localization: Localization, backend: str, error: PoseError | None) -> dict[str, Any]:

@@ -70,12 +70,9 @@ def common_style() -> Any:
 def new_figure(width: float, height: float) -> Any:
     """Return an empty figure of the given size (inches) that has no window and is not managed by pyplot."""
     require_matplotlib()
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
+    return Figure(figsize=(width, height), layout="constrained")
 
 
 def save_figure(figure: Any, folder: Path, name: str) -> Path:

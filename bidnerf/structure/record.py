@@ -70,24 +70,22 @@ class FoundPoses:
         )
 
     def __str__(self) -> str:
-        lines = [
+        several, more = len(self.models) > 1, len(self.left_out) - 5
+        lines = (
             f"poses of {self.placed} of {amount(self.photos, 'photo')}; {amount(self.points, 'point')}, mean error"
-            f" {self.reprojection_error:.2f} px{'; in metres, by the measured depth' if self.metric else ''}"
-        ]
-        if len(self.models) > 1:
-            sizes = ", ".join(map(str, self.models))
-            lines.append(
-                f"the photos fall into {len(self.models)} unconnected models of {sizes} photos; the largest is kept"
-            )
-        if self.turned:
-            lines.append(
-                f"{amount(self.turned, 'photo')} turned by EXIF: the dataset has the cameras of the images as stored, while"
-                " a photo is localized upright"
-            )
-        lines += [f"left out {left.photo}: {left.reason}" for left in self.left_out[:5]]
-        if len(self.left_out) > 5:
-            lines.append(f"left out {len(self.left_out) - 5} more, see {RECORD}")
-        return "\n".join(lines)
+            f" {self.reprojection_error:.2f} px{'; in metres, by the measured depth' if self.metric else ''}",
+            f"the photos fall into {len(self.models)} unconnected models of {', '.join(map(str, self.models))} photos;"
+            " the largest is kept"
+            if several
+            else "",
+            f"{amount(self.turned, 'photo')} turned by EXIF: the dataset has the cameras of the images as stored, while"
+            " a photo is localized upright"
+            if self.turned
+            else "",
+            *(f"left out {left.photo}: {left.reason}" for left in self.left_out[:5]),
+            f"left out {more} more, see {RECORD}" if more > 0 else "",
+        )
+        return "\n".join(filter(None, lines))
 
 
 def digest(files: Sequence[Path], camera: Camera | CameraSource | str | Path | None) -> str:

@@ -28,7 +28,6 @@ from .textured_field import POSES as POSES
 from .textured_field import MapWithLandmarks as MapWithLandmarks
 from .textured_field import TexturedGround as TexturedGround
 from .textured_field import ground as ground
-from .textured_field import seen as seen
 from .textured_field import textured_map as textured_map
 from .textured_field import textured_view as textured_view
 from .textured_field import training_views as training_views

@@ -23,13 +23,12 @@ from bidnerf.testing.faults import (
     require,
 )
 from bidnerf.testing.textured_field import (
-    GROUND_CAMERA,
     POSES,
     T_MOVED_WORLD,
     MapWithLandmarks,
     moved_map,
-    seen,
     textured_map,
+    textured_view,
     training_views,
     unseen,
 )
@@ -123,9 +122,7 @@ class MethodContract(Named):
         )
 
     def test_image_of_another_scene_is_rejected(self) -> None:
-        found = self._localize(
-            textured_map(surface=True), seen(POSES[1], GROUND_CAMERA, "other", seed=1).frame, POSES[1]
-        )
+        found = self._localize(textured_map(surface=True), textured_view(POSES[1], "other", seed=1).frame, POSES[1])
         require(
             self._who,
             (

@@ -66,13 +66,8 @@ def ground(seed: int = 0) -> TexturedGround:
     return TexturedGround(seed)
 
 
-def textured_view(T: SE3, name: str = "", seed: int = 0) -> View:
-    """Return an image of the ground with its depth."""
-    return seen(T, GROUND_CAMERA, name, seed)
-
-
-def seen(T: SE3, camera: Intrinsics, name: str = "", seed: int = 0) -> View:
-    """Return an image of the ground from any camera, with its depth."""
+def textured_view(T: SE3, name: str = "", seed: int = 0, camera: Intrinsics = GROUND_CAMERA) -> View:
+    """Return an image of the ground, with its depth."""
     image = render_image(ground(seed), camera, T, BOUNDS, chunk=512)  # whose waves stay in the cache
     return View(Frame(name, image.rgb, camera, torch.where(image.opacity > 0.95, image.depth, 0)), T)
 

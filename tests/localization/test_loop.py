@@ -20,9 +20,8 @@ import torch
 from bidnerf import SE3, Intrinsics, Localization, Localizer, Outcome, View
 from bidnerf.evaluation import faulty
 from bidnerf.results import pose_error
-from bidnerf.testing import GROUND_CAMERA, TexturedGround, textured_map, training_views, unseen
+from bidnerf.testing import GROUND_CAMERA, TexturedGround, textured_map, textured_view, training_views, unseen
 from bidnerf.testing import POSES as GROUND_POSES
-from bidnerf.testing import seen as seen_ground
 from bidnerf_core.fields import FieldValues
 from bidnerf_core.localization import AutoConfig, LandmarkAnswer, LandmarkMatcher, LogisticModel, Loop, rig
 from bidnerf_core.mapping import LandmarkMap
@@ -240,7 +239,7 @@ def stated(view: View, factor: float) -> list[View]:
 def other_camera(factor: float) -> list[View]:
     """Return a photo of a camera that is nearly the map's, and says so."""
     camera = scaled(factor, GROUND_CAMERA)
-    return stated(seen_ground(GROUND_POSES[1], camera), 1.0)
+    return stated(textured_view(GROUND_POSES[1], camera=camera), 1.0)
 
 
 def own_correlation() -> LandmarkMap:
@@ -422,7 +421,7 @@ def test_in_a_moved_world_the_answer_moves(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_images_of_different_cameras_are_localized_with_the_stated_ones() -> None:
     first, second = training_views()[0], unseen()
-    other = seen_ground(first.T_ref_camera, scaled(0.8, GROUND_CAMERA))
+    other = textured_view(first.T_ref_camera, camera=scaled(0.8, GROUND_CAMERA))
     found = Localizer(with_landmarks(ground_landmarks()), config=NOT_RENDERED)(
         [colour_only(other), colour_only(second)]
     )
