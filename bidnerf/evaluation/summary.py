@@ -41,11 +41,8 @@ class Situation:
     @property
     def start(self) -> str:
         """The start in words, with the image faults if any."""
-        words = "no start" if self.protocol == "none" else self.protocol
-        if self.size is None:
-            words += ", all sizes"
-        elif self.protocol != "none":
-            words = f"{words} {' : '.join(f'{number:g}' for number in self.size)}".rstrip()
+        size = ", all sizes" if self.size is None else f" {' : '.join(f'{number:g}' for number in self.size)}"
+        words = f"{'no start' if self.protocol == 'none' else self.protocol}{size}".rstrip()
         return words if self.fault == NO_FAULT else f"{words}, {self.fault}"
 
 
@@ -106,7 +103,7 @@ def situation_titles(every: Sequence[Situation]) -> dict[Situation, str]:
         name = f"{s.map} ({s.weights.partition('.')[0]})" if retrained else s.map
         names = [name] if len(maps) > 1 or retrained else []
         names += [f"{s.data}/{s.split}"] if len(datasets) > 1 else []
-        titles[s] = ": ".join([" on ".join(names), s.start] if names else [s.start])
+        titles[s] = ": ".join(filter(None, (" on ".join(names), s.start)))
     return titles
 
 

@@ -46,12 +46,10 @@ class LidarDepth:
     def __call__(self, depth: Path, confidence: Path | None) -> DepthImage:
         """Read a depth image stored in millimetres and its confidence image. Raises ``InputError`` as ``sure`` does."""
         measured = read_depth_image(depth, MILLIMETRE)
-        if confidence is None:
-            return self.sure(measured, None, "")
-        sure = decode(confidence)
-        if sure.ndim != 2:
+        sure = None if confidence is None else decode(confidence).astype(np.int64)
+        if sure is not None and sure.ndim != 2:
             raise InputError(f"has {sure.shape[-1]} channels", where=confidence, expected="one")
-        return self.sure(measured, sure.astype(np.int64), str(confidence))
+        return self.sure(measured, sure, str(confidence))
 
     def sure(self, measured: DepthImage, confidence: Integer[np.ndarray, "h w"] | None, where: str) -> DepthImage:
         """Return the depth where its confidence, if known, is high, and 0 elsewhere.

@@ -81,12 +81,9 @@ def _read(path: Path, cameras: Path, options: DatasetOptions) -> Capture:
 
 def _find(path: Path) -> Path | None:
     """Return the camera folder that has a photo folder beside it, ignoring hidden files such as ``._NAME`` from macOS."""
-    for prefix in ("corrected_", ""):
-        for base in (path / "keyframes", path):
-            cameras = base / f"{prefix}cameras"
-            if (base / f"{prefix}images").is_dir() and any(cameras.glob("[!.]*.json")):
-                return cameras
-    return None
+    folders = ((base, prefix) for prefix in ("corrected_", "") for base in (path / "keyframes", path))
+    found = (base / f"{prefix}cameras" for base, prefix in folders if (base / f"{prefix}images").is_dir())
+    return next((cameras for cameras in found if any(cameras.glob("[!.]*.json"))), None)
 
 
 reader = Format(

@@ -120,7 +120,6 @@ def _furniture() -> list[Primitive]:
         _solid(box((0.16, 0.6, 0.02)), (-1.84, -0.6, z), stripes(C.wood, C.oak, (0, 1, 0), 0.4))
         for z in (0.4, 0.85, 1.3)
     ]
-    books = []
     paints = [
         (C.red, C.cream),
         (C.teal, C.sand),
@@ -130,10 +129,15 @@ def _furniture() -> list[Primitive]:
         (C.rose, C.cream),
         (C.blue, C.sand),
     ]
-    for i, (first, second) in enumerate(paints):
-        tall, board, position = 0.13 + 0.015 * (3 * i % 5), (0.4, 0.85, 1.3)[i % 3], -1.05 + 0.14 * i
-        paint = stripes(first, second, (0, 0.3, 1), 0.22, phase=float(i))
-        books.append(_solid(box((0.12, 0.07, tall)), (-1.85, position, board + 0.02 + tall), paint))
+    talls = [0.13 + 0.015 * (3 * i % 5) for i in range(len(paints))]
+    books = [
+        _solid(
+            box((0.12, 0.07, tall)),
+            (-1.85, -1.05 + 0.14 * i, (0.4, 0.85, 1.3)[i % 3] + 0.02 + tall),
+            stripes(*paint, (0, 0.3, 1), 0.22, phase=float(i)),
+        )
+        for i, (paint, tall) in enumerate(zip(paints, talls, strict=True))
+    ]
     return [
         _solid(box((2.0, 1.5, 1.25)), (0, 0, 1.25), walls),
         _solid(cylinder(0.75, 0.012), (0.25, -0.1, 0.0), blotches(C.red, C.navy, 0.5, 13)),
