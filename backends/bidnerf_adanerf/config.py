@@ -46,7 +46,7 @@ class AdaNerfConfig(SupervisionConfig):
     carve: bool = True  # treat bins as empty in training where depth and silhouettes rule out matter
     # number of cells along the scene's longest side in the grid of empty space
     room_resolution: Annotated[int, Range(2, 1024)] = 64
-    seed: Annotated[int, Range(0)] = 0  # seed of the initial weights and of all random draws
+    seed: Annotated[int, Range(0), "N"] = 0  # seed of the initial weights and of all random draws
 
     def __post_init__(self) -> None:
         super().__post_init__()

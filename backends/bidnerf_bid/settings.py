@@ -19,7 +19,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields import RadianceField, levels
 from bidnerf_core.geometry import Robust
 from bidnerf_core.localization import ColourSettings, DepthLossSettings
-from bidnerf_core.settings import EXPERT, Above, Count, NotNegative, OneOf, Range, Settings
+from bidnerf_core.settings import EXPERT, Above, Count, NotNegative, OneOf, Positive, Range, Settings
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,10 @@ class DepthSettings(DepthLossSettings):
 
     # weight of the depth term, per square metre; the photometric term has weight 1
     depth_weight: NotNegative = 1.0
-    depth_residual: Annotated[str, OneOf(DEPTH_RESIDUALS), EXPERT] = "distance"  # how depths are compared
+    # depth difference, metres, at which outliers begin (default: 3.8 % of the scene's mean side)
+    depth_scale: Positive | None = None
+    # how depths are compared: distance, truncated or first-surface
+    depth_residual: Annotated[str, OneOf(DEPTH_RESIDUALS), EXPERT] = "distance"
     # number of rays drawn from a sensor with rays of its own
     depth_rays: Annotated[int, Range(0, 10**7), EXPERT] = 512
     # weight of the term that penalises matter in front of measured depth
@@ -56,7 +59,8 @@ class DescentSettings(Settings):
     """Settings of the rays of a step and of the frame of updates."""
 
     rays: Count = 2048  # number of rays per step, divided equally among the views
-    level: int | None = None  # level of the field: 0 is the coarsest, None the field itself
+    # level of the field: 0 is the coarsest, -1 the finest, which inerf uses by default
+    level: int | None = None
     pixels: DrawerName = "uniform"  # where pixels are drawn: anywhere, at corners, around corners
     pivot: PivotName = "camera"  # what an update rotates about: camera, world, or the middle of the scene
     # length of the sampled interval, in units of [near, far]; the paper's "wide" is 2
@@ -89,9 +93,11 @@ class AdamSettings(Settings):
     max_steps: Count = 200  # maximum number of steps
     # initial length of a step, metres and radians; None: 1.25 % of the distance to the pivot
     learning_rate: Annotated[float, Above(0.0, 1e3)] | None = None
-    decay: Annotated[float, Above(0.0, 1.0)] = 0.8  # factor by which the learning rate falls in decay_steps
-    decay_steps: Count = 100  # number of steps in which the learning rate falls by decay
-    # stop once the mean loss of 20 steps is below this (epsilon of Alg. 1); 0: never
+    # factor by which the learning rate falls every `decay_steps` steps
+    decay: Annotated[float, Above(0.0, 1.0)] = 0.8
+    # number of steps in which the learning rate falls by the factor `decay`
+    decay_steps: Count = 100
+    # stop once the mean loss of 20 steps is below this (epsilon in Algorithm 1 of BID-NeRF); 0: never
     stop_loss: NotNegative = 0.0
     converged_loss: NotNegative = 0.02  # mean loss of 20 steps below which the answer counts as converged
 

@@ -40,7 +40,7 @@ class HashEncodingConfig(Settings):
     """
 
     levels: Annotated[int, Range(1, 64)] = 16  # number of levels of resolution
-    features: Annotated[int, Range(1, 64)] = 2  # number of features of an entry; even numbers are faster
+    features: Annotated[int, Range(1, 64)] = 2  # features per table entry; even numbers are faster
     log2_table_size: Annotated[int, Range(1, 30)] = 19  # entries of a level's table, as a power of two
     base_resolution: Annotated[float, Range(1, 2**20)] = 16  # cells along a side at the coarsest level
     # cells along a side at the finest level, or their maximum

@@ -54,7 +54,7 @@ class HashGridConfig(FieldConfig, SupervisionConfig):
     learning_rate: Positive = 2e-2
     # steps from one update of the coarse field to the next; 0: it is not trained
     coarse_every: Annotated[int, Range(0)] = 4
-    seed: Annotated[int, Range(0)] = 0  # seed of the initial weights and of all random draws
+    seed: Annotated[int, Range(0), "N"] = 0  # seed of the initial weights and of all random draws
     rays_at_most: Count = 16384  # maximum number of rays per step
     prune_from: Annotated[int, Range(0)] = 200  # first step at which empty cells are skipped
     prune_every: Count = 16  # steps from one update of the occupied cells to the next

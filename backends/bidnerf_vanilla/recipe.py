@@ -36,7 +36,7 @@ class VanillaConfig(FieldConfig, SupervisionConfig):
     samples_per_step: Count = 4096
     rays_at_most: Count = 4096  # maximum number of rays per step
     learning_rate: Positive = 3e-3  # initial learning rate
-    seed: Annotated[int, Range(0)] = 0  # seed of the initial weights and of all random draws
+    seed: Annotated[int, Range(0), "N"] = 0  # seed of the initial weights and of all random draws
     carve: bool = True  # skip the cells that the views' depth and silhouettes show to be empty
 
     def __post_init__(self) -> None:

@@ -142,7 +142,9 @@ class Parameter:
         text = spelled(" ".join((text or self.doc).replace("``", "'").split()), option_name)
         if default is MISSING and not option.positional:
             text += " (required)"
-        return (f"{text} (default: {words.replace('True', 'yes')})" if words else text).replace("%", "%%")
+        elif words and "(default: " not in text:
+            text += f" (default: {words.replace('True', 'yes')})"
+        return text.replace("%", "%%")
 
 
 def parse(command: str, target: Callable[..., T], arguments: Sequence[str]) -> T:

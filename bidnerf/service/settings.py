@@ -24,13 +24,16 @@ class ServiceLimits(Settings):
 
     workers: Annotated[Annotated[int, Range(1, 1000)] | None, "N"] = None
     """number of single-threaded processes that localize (default: one per core)"""
-    queue: Annotated[int, Range(0, 100_000), EXPERT] = (
-        16  # requests that may upload or wait besides those at work; further ones get status 429
-    )
-    timeout: Limit = 60.0  # seconds for an answer, counted from the complete request; else status 504
-    upload_timeout: Limit = 20.0  # seconds within which a request must have arrived; else status 408
-    max_megabytes: Limit = 32.0  # largest request, in MiB; a larger one gets status 413
-    max_megapixels: Limit = 50.0  # largest image, by the size in its header; a larger one gets status 422
+    # requests that may upload or wait besides those in progress; further ones get status 429
+    queue: Annotated[int, Range(0, 100_000), EXPERT, "N"] = 16
+    # time for an answer, counted from the complete request; else status 504
+    timeout: Annotated[Limit, "SECONDS"] = 60.0
+    # time within which a request must have arrived; else status 408
+    upload_timeout: Annotated[Limit, "SECONDS"] = 20.0
+    # largest request; a larger one gets status 413
+    max_megabytes: Annotated[Limit, "MIB"] = 32.0
+    # largest image, by the size in its header; a larger one gets status 422
+    max_megapixels: Annotated[Limit, "MP"] = 50.0
 
     @property
     def processes(self) -> int:

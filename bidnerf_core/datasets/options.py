@@ -36,30 +36,30 @@ class DatasetOptions:
     Splatting or an answer, COLMAP's cameras.txt, a list of hloc, YAML of ROS, OpenCV, ORB-SLAM or Kalibr, ROS's ost.txt, XML of
     OpenCV or Agisoft, or a 3x3 matrix as text (TUM RGB-D: also freiburg1, freiburg2 or freiburg3)"""
 
-    images: Annotated[str | Path | None, EXPERT, "FOLDER"] = None
-    """folder of the images that the files of a dataset list, if they lie elsewhere"""
+    images: Annotated[str | Path | None, EXPERT, "DIR"] = None
+    """folder of the images that the files of a dataset list, if they lie elsewhere (default: as the format says)"""
 
     split: Annotated[str, "NAME"] = "train"
     """split of the dataset; all: every image with a pose"""
 
     register_depth: Annotated[DepthRegistration | None, EXPERT, "SENSOR.json"] = None
     """file with the intrinsics of the depth camera and T_colour_depth (4x4), from which depth is registered to colour images;
-    'no' if depth is already registered"""
+    'no' if depth is already registered (default: as the format says)"""
 
     depth_unit: Annotated[float | None, EXPERT, "METRES"] = None
-    """metres per step of the depth images, such as 0.001 for millimetres"""
+    """metres per step of the depth images, such as 0.001 for millimetres (default: as the format says)"""
 
     masks: Annotated[str | Path | MaskFolder | None, "DIR"] = None
-    """masks named like the images: black pixels are ignored, such as people or the robot itself"""
+    """folder of masks named like the images; black pixels are ignored, for example people"""
 
     mask_hides: Annotated[Literal["black", "white"], EXPERT, "COLOUR"] = "black"
     """colour in --masks that is ignored: black or white"""
 
     largest: Annotated[int | None, WholeNumbers(1), EXPERT, "PX"] = None
-    """longer side to which larger images are downscaled"""
+    """longer side to which larger images are downscaled (default: 1600, or less if memory is short or the format says so)"""
 
     background: Annotated[Background | None, EXPERT, "COLOUR"] = None
-    """colour behind images with alpha: white or black"""
+    """colour behind images with alpha: white or black (default: white for transforms.json with alpha, else black)"""
 
     def __post_init__(self) -> None:
         if self.masks is None and self.mask_hides != "black":

@@ -31,7 +31,7 @@ class DepthLossSettings(Settings):
     # weight of the depth term; the photometric term has weight 1, and differences are in units of their scales
     depth_weight: NotNegative = 4.0
     depth_loss: RobustName = "huber"  # robust loss of depth differences
-    # depth difference, metres, at which outliers begin; None: 1.9 % of the scene's mean side, in first-order steps twice as much
+    # depth difference, metres, at which outliers begin (default: 1.9 % of the scene's mean side)
     depth_scale: Positive | None = None
 
 
@@ -65,15 +65,15 @@ class AutoConfig(Settings):
     landmarks: bool = True  # match image features with the map's landmarks first, if it has any
     # number of rendered rays fused with vague poses by landmarks; 0: nothing is rendered
     fused_rays: Annotated[int, Range(0, 10**6)] = 1024
-    # the depth sensor: unknown, kinect, realsense, lidar or rendered
+    # sensor that measured the depth: unknown, kinect, realsense, lidar or rendered
     depth_sensor: Annotated[str, OneOf(DEPTH_SENSORS)] = "unknown"
-    # tolerated fraction of wrong answers among the accepted ones; None for the usual acceptance
-    risk: float | None = None
-    # largest position error (in the map's unit) of a right pose; None: 3 % of the distance of the scene
+    # tolerated fraction of wrong poses among those accepted (default: accepted as usual)
+    risk: Annotated[float | None, "FRACTION"] = None
+    # largest position error (in the map's unit) of a right pose (default: 3 % of the distance of the scene)
     tolerance: Positive | None = None
     # The rest is of searches by images, which end with steps on rendered rays, and of their acceptance by newly drawn rays.
     fine_steps: Annotated[int, Range(1, 10**5), EXPERT] = 8  # steps of the best pose, in full detail
-    # number of rays rendered for each of the fine steps, and of fractions of it before
+    # number of rays rendered for each of the fine steps; earlier steps use a fraction of it
     fine_rays: Annotated[int, Range(7, 10**7), EXPERT] = 1024
     colour: Annotated[ColourSettings, EXPERT] = ColourSettings()
     # minimum inlier fraction of the rays for an accepted pose

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -34,10 +35,9 @@ from bidnerf_core.settings import Settings
 class StructureSettings(Settings):
     """Where the keypoints are from."""
 
-    # file of the keypoints of which the model was made, with their descriptors: a database of COLMAP (.db), or features of hloc
-    # (.h5), which need their detector (--landmark-features) and h5py; "": a database.db beside the model, or else the photos;
-    # photos: the photos
-    keypoints: str = ""
+    # COLMAP database (.db) or hloc features (.h5, with `landmark_features` and h5py) that hold the model's keypoints; 'photos' detects
+    # them anew (default: database.db beside the model, else the photos)
+    keypoints: Annotated[str, "FILE"] = ""
 
 
 class StructureImporter:

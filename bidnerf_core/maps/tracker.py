@@ -46,8 +46,8 @@ from bidnerf_core.settings import Above, Settings
 class TrackerConfig(Settings):
     """Settings of a tracker."""
 
-    # interval between frames without time stamps, seconds
-    frame_seconds: Annotated[float, Above(0.0, 1e4)] = 1 / 30
+    # interval between frames without time stamps
+    frame_seconds: Annotated[float, Above(0.0, 1e4), "SECONDS"] = 1 / 30
 
 
 class Tracker:

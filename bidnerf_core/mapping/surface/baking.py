@@ -67,7 +67,7 @@ class BakeConfig(Settings):
     rays: Annotated[int, Range(1000, 10**9)] = 300_000
     # number of pixels of measured depth used, divided equally among the views
     measured: Annotated[int, Range(1000, 10**9)] = 2_000_000
-    # maximum number of cells in the scene's box; those far from the surface take no memory
+    # maximum number of cells in the scene's box; those far from the surface take no memory (default: limited by `megabytes` only)
     cells: Annotated[int, Range(1000, MOST_CELLS)] = MOST_CELLS
     megabytes: Annotated[float, Above(0)] = 200.0  # memory limit of the surface, which makes cells coarser
     opacity: Annotated[float, Above(0, 0.999)] = 0.9  # opacity below which a ray meets no surface
