@@ -22,17 +22,17 @@ DESCENT = {"rays": 768, "max_steps": 150, "decay_steps": 60}  # faster than the 
 
 
 def run_demo(
-    backend: Annotated[str, installed("backends"), Option("NAME", "one of 'bidnerf backends'")] = USUAL_BACKEND,
+    backend: Annotated[str, installed("backends"), Option("NAME", "kind of field, one of 'bidnerf backends'")] = USUAL_BACKEND,
     out: Annotated[Path, Option("DIR", "folder for the map, the images and the pictures")] = Path("demo-out"),
     frames: Annotated[int, WholeNumbers(1), Option("N", "number of unseen frames to localize")] = 4,
     steps: Annotated[int | None, WholeNumbers(1), Option("N", "training steps", "the backend's quick choice")] = None,
     seed: Annotated[Seed, EXPERT] = 0,
     overwrite: Overwrite = False,
 ) -> None:
-    """Train a map of a closed-form scene, and localize frames in it.
+    """Train a map of a synthetic scene, and localize frames in it.
 
     The frames are RGB-D images from poses that training never saw. Method auto finds each pose without a start, and method bid that of the first frame
-    from a start far from it. The results are drawn.
+    from a start far from it. Pictures of the results are saved.
     """
     from bidnerf.results import Painter, pose_error
     from bidnerf.scenes import demo_object, orbit, views

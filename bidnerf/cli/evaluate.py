@@ -11,6 +11,7 @@ from urllib.parse import quote
 
 from bidnerf.cli.options import (
     TEST_IMAGES,
+    DaskAddress,
     FrameNames,
     MethodGroup,
     MethodOptions,
@@ -49,7 +50,8 @@ class TrialOptions:
         tuple[str, ...],
         Option(
             "SIZE...",
-            "error of the start: metres for bid and bid-hard (e_t of that paper), METRES:DEGREES for perturb",
+            "error of the start in units of the map, metres if it is metric: a length for bid and bid-hard (e_t in the"
+            " BID-NeRF paper), LENGTH:DEGREES for perturb",
             "the protocol's",
         ),
     ] = ()
@@ -111,9 +113,7 @@ class WorkOptions(RunOptions):
         WholeNumbers(1, 10_000),
         Option("N", "number of single-threaded processes", "one per core; one on a GPU"),
     ] = None
-    dask: Annotated[
-        str | None, EXPERT, Option("ADDRESS", "address of a dask scheduler whose workers run the trials")
-    ] = None
+    dask: Annotated[DaskAddress, Option("ADDRESS", "address of a dask scheduler whose workers run the trials")] = None
 
 
 def run_evaluate(
@@ -121,7 +121,12 @@ def run_evaluate(
     out: Annotated[Path, Option("RESULTS.jsonl", "results file; trials already in it are not run again")],
     data: Annotated[
         str | None,
-        Option("[DATA]", "folder of a dataset, or demo:object, demo:room, demo:blobs", positional=True),
+        Option(
+            "[DATA]",
+            "folder of a dataset, or demo:object, demo:room, demo:blobs",
+            "the scene of a demo: MAP",
+            positional=True,
+        ),
     ] = None,
     *,
     starts: Starts,
@@ -129,9 +134,9 @@ def run_evaluate(
     images: SeenImages = TEST_IMAGES,
     method: MethodGroup,
 ) -> None:
-    """Localize many frames of a dataset, and write a JSON line a trial.
+    """Localize many frames of a dataset, and write one JSON line per trial.
 
-    Trials begin at perturbed starts, or at none. Finished trials are always kept: the same command resumes where it stopped.
+    Trials begin at perturbed starts, or without a start. Finished trials are always kept: the same command resumes where it stopped.
     'bidnerf report' makes tables and figures from the results.
     """
     from bidnerf.evaluation import evaluate
@@ -166,24 +171,31 @@ def run_compare(
             positional=True,
         ),
     ],
-    out: Annotated[Path | None, Option("DIR", "write compare.json, compare.png and compare.svg there")] = None,
+    out: Annotated[
+        Path | None, Option("DIR", "write compare.json, compare.png and compare.svg there", "not written")
+    ] = None,
     size: Annotated[
         str | None,
         Option(
             "SIZE",
-            "error of the start: metres for bid and bid-hard (e_t of that paper), METRES:DEGREES for perturb",
+            "error of the start in units of the map, metres if it is metric: a length for bid and bid-hard (e_t in the"
+            " BID-NeRF paper), LENGTH:DEGREES for perturb",
             "the protocol's first",
         ),
     ] = None,
     *,
-    starts: Annotated[Starts, Without("size", "no_depth", "fault")],
+    starts: Annotated[
+        Starts,
+        Without("size", "no_depth", "fault"),
+        Group("trials", "Which frames are tried, and from which starts."),
+    ],
     run: RunOptions,
     images: SeenImages = TEST_IMAGES,
     method: MethodGroup,
 ) -> None:
     """Localize the same frames in several maps, and compare the results.
 
-    The starts are the same; success, steps, time and memory are compared. Each map has its own process, and the maps take turns at
+    The starts are the same; success, steps, time and memory are compared. Each map runs in its own process; they take turns at
     each start.
     """
     if len(folders) < 2:
@@ -218,8 +230,8 @@ def run_report(
         EXPERT,
         Option(
             None,
-            "success criterion for displays that use only one: 10% of the start's error, 5 degrees and 0.05 or 1 degree and"
-            " 0.02 of the map's unit",
+            "success criterion where only one is shown: 10% (of the start's error), 5deg (5 degrees, 0.05 units), 1deg (1"
+            " degree, 0.02 units)",
             "10%; 5deg if trials had no start",
         ),
     ] = None,

@@ -49,7 +49,9 @@ class StartOptions:
     perturb: Annotated[
         tuple[float, float] | None,
         Option(
-            "T R", "start from the dataset's pose moved by T metres and R degrees, each frame in a direction of its own"
+            "T R",
+            "start from the dataset's pose moved by T units of the map (metres if it is metric) and R degrees, each frame in a"
+            " direction of its own",
         ),
     ] = None
     seed: Annotated[Seed, EXPERT] = 0
@@ -104,7 +106,7 @@ class AnswerOutput(RunOptions):
 
 
 def run_localize(
-    map: MapFolder,
+    map: Annotated[MapFolder, Option("MAP", "folder of a map, or of several maps", positional=True)],
     query: Annotated[
         tuple[Path, ...],
         Option(

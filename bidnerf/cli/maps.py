@@ -113,7 +113,7 @@ def run_scale(
     poses: Annotated[
         Path | None,
         Option(
-            "JSON",
+            "POSES.json",
             "file with the true positions of three or more of the map's cameras in metres, in any world:"
             " {NAME: [x, y, z], ...}, or poses as localize --out POSES.json writes them",
         ),
@@ -121,14 +121,16 @@ def run_scale(
     factor: Annotated[
         float | None, Above(0.0), Option("F", "metres per unit of the map; 1 states that its unit is the metre")
     ] = None,
-    out: Annotated[Path | None, Option("MAP2", "leave the map unchanged and write a new one")] = None,
+    out: Annotated[
+        Path | None, Option("MAP2", "leave the map unchanged and write a new one", "MAP is replaced")
+    ] = None,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
     """Convert a map to metres.
 
-    All of it is converted: field, bounds, surface, landmarks, capture record and anchor. Poses, covariances and errors are then in metres, and the depth of sensors fits. One of --distance, --poses and --factor
-    gives the length of a unit.
+    All of it is converted: field, bounds, surface, landmarks, capture record and anchor. Poses, covariances and errors are then in metres, so measured depth can be used. Exactly one of
+    --distance, --poses and --factor is required: it gives the length of a unit.
     """
     from bidnerf.results import read_positions
     from bidnerf_core.maps import factor_of_distance, factor_of_poses, load_info, load_map, map_folder
@@ -160,7 +162,7 @@ def run_scale(
 
 def run_render(
     map: MapFolder,
-    data: Annotated[Path, Option("DATA", "folder of a dataset, or a .r3d file", positional=True)],
+    data: Annotated[Path, Option("DATA", "folder of a dataset", positional=True)],
     out: Annotated[Path, Option("DIR", "folder for the images")],
     frame: FrameNames = (),
     level: Annotated[
@@ -172,8 +174,8 @@ def run_render(
 ) -> None:
     """Render a map from the poses of a dataset.
 
-    Writes NAME.png (8-bit RGB) and NAME.depth.png (16-bit, planar z in mm, 0 where rays hit nothing) per frame into --out, and
-    prints PSNR and depth error against the dataset's images.
+    For each frame, NAME.png (8-bit RGB) and NAME.depth.png (16-bit, planar z in mm, 0 where rays hit nothing) are written to
+    --out, and PSNR and depth error against the dataset's images are printed.
     """
     from bidnerf_core.io import output_folder
     from bidnerf_core.maps import load_info, load_map
@@ -351,7 +353,7 @@ class WorldOptions:
     T_world_file: Annotated[
         Path | None,
         EXPERT,
-        Option("POSE", "file of a pose (JSON, 4x4) that takes the scaled coordinates of the file to the world"),
+        Option("POSE.json", "file of a pose (JSON, 4x4) that takes the scaled coordinates of the file to the world"),
     ] = None
 
 
@@ -364,7 +366,7 @@ def run_import(
     importer: Annotated[
         str | None,
         installed("importers"),
-        Option("NAME", "one of 'bidnerf plugins importers'", "the one that recognizes the file"),
+        Option("NAME", "importer to use, one of 'bidnerf plugins importers'", "the one that recognizes the file"),
     ] = None,
     *,
     world: Annotated[WorldOptions, Group("world", "How the coordinates of the file become those of the map.")],
@@ -376,7 +378,11 @@ def run_import(
     images: ColourImages,
     config: Annotated[
         Any,
-        SettingsGroup("settings of the importer", "What the importer cannot find in the file.", _importer_settings),
+        SettingsGroup(
+            "settings of the importer named by --importer",
+            "What the importer cannot find in the file.",
+            _importer_settings,
+        ),
     ] = None,
 ) -> None:
     """Build a map from a COLMAP model, or a field trained elsewhere.

@@ -26,20 +26,22 @@ ImageOptions: TypeAlias = Annotated[DatasetOptions, Group("images", "How the ima
 MappedImages: TypeAlias = Annotated[ImageOptions, Without("background")]  # in the map, which has a background
 SeenImages: TypeAlias = Annotated[MappedImages, Without("largest")]  # localized at the size that the method chooses
 WholeImages: TypeAlias = Annotated[SeenImages, Without("masks", "mask_hides")]  # of which every pixel counts
-ColourImages: TypeAlias = Annotated[WholeImages, Without("register_depth", "depth_unit")]  # whose depth is not used
+ColourImages: TypeAlias = Annotated[  # whose depth is not used
+    WholeImages, Without("register_depth", "depth_unit"), Group("images", "How the images are read.")
+]
 
 MapFolder: TypeAlias = Annotated[Path, Option("MAP", "folder of a map, as written by 'bidnerf train'", positional=True)]
-Device: TypeAlias = Annotated[str, Option("NAME", "device on which the field computes: cpu, cuda ...")]
+Device: TypeAlias = Annotated[str, Option("NAME", "device to compute on, such as cpu, cuda or cuda:1")]
 Host: TypeAlias = Annotated[
     str | None,
-    Option("ADDRESS", "address to listen on, such as 0.0.0.0; others then need a token", "this machine only"),
+    Option("ADDRESS", "address to listen on, such as 0.0.0.0; clients then need a token", "this machine only"),
 ]
 Port: TypeAlias = Annotated[int, WholeNumbers(0, 65535), Option("N", "port to listen on; 0 picks a free one")]
 Seed: TypeAlias = Annotated[int, WholeNumbers(0, LARGEST_SEED), Option("N", "seed of every random choice")]
-Json: TypeAlias = Annotated[bool, FLAG, Option(None, "print JSON: one value on a line")]
+Json: TypeAlias = Annotated[bool, FLAG, Option(None, "print JSON, one value per line")]
 NoDepth: TypeAlias = Annotated[bool, FLAG, Option(None, "leave out measured depth")]
 Names: TypeAlias = tuple[str, ...]
-FrameNames: TypeAlias = Annotated[Names, Option("NAME...", "use only these frames of a dataset", "all of the split")]
+FrameNames: TypeAlias = Annotated[Names, Option("NAME...", "use only these frames of the dataset", "all of the split")]
 
 
 BakeSettings: TypeAlias = Annotated[
@@ -74,6 +76,11 @@ def pose_file_help() -> str:
 MethodName: TypeAlias = Annotated[
     str, installed("methods"), Option("NAME", "method that finds poses, one of 'bidnerf plugins methods'")
 ]
+DaskAddress: TypeAlias = Annotated[
+    str | None,
+    EXPERT,
+    Option("ADDRESS", "address of a dask scheduler whose workers detect and match keypoints"),
+]
 Overwrite: TypeAlias = Annotated[bool, FLAG, Option(None, "replace output that exists")]
 
 
@@ -101,7 +108,7 @@ class MethodOptions:
     preset: Annotated[
         str | None,
         EXPERT,
-        Option("NAME", "settings of the method to begin with, such as the paper's", "the usual ones"),
+        Option("NAME", "settings to begin with; bid: paper, paper-scene; inerf: paper", "the usual ones"),
     ] = None
     config: Annotated[
         Any,
@@ -196,7 +203,7 @@ PhotoCamera: TypeAlias = Annotated[
 ]
 NewPhotoCamera: TypeAlias = Annotated[
     CameraOptions,
-    Group("camera", "The camera of photos without poses. Otherwise, EXIF and the photos give it."),
+    Group("camera", "The camera of photos without poses. By default, it is estimated from EXIF and the photos."),
 ]
 
 

@@ -29,14 +29,14 @@ def run_plugins(
 
 
 def run_backends(json: Json = False) -> None:
-    """List the installed kinds of field."""
+    """List the installed backends, the kinds of field."""
     _print_infos(list_plugins("backends"), json)
 
 
 def run_doctor(json: Json = False) -> None:
     """Describe the installation: versions, devices, extras and plugins.
 
-    A bug report needs this. The exit status is 1 if a package that bidnerf requires is missing, or has a version that is not supported.
+    Please attach the output to bug reports. The exit status is 1 if a package that bidnerf requires is missing, or has a version that is not supported.
     """
     needed = requirements()
     broken = [requirement for requirement in needed if not requirement.is_met]

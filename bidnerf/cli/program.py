@@ -121,6 +121,7 @@ def _usage() -> str:
             *lines,
             "",
             "'bidnerf demo' is a tour of two minutes; 'bidnerf COMMAND --help' describes a command.",
+            "'bidnerf --version' prints the version.",
         ]
     )
 

@@ -38,7 +38,7 @@ class FrameOptions:
     every: Annotated[int, WholeNumbers(1), Option("N", "use only every Nth frame")] = 1
     no_depth: NoDepth = False
     depth_sensor: Annotated[
-        str, EXPERT, Option("NAME", "what measured the depth: unknown, kinect, realsense, lidar or rendered")
+        str, EXPERT, Option("NAME", "sensor that measured the depth: unknown, kinect, realsense, lidar or rendered")
     ] = "unknown"
     camera: PhotoCamera = CameraOptions()
 
@@ -54,7 +54,7 @@ class TrackingOptions:
         float | None,
         EXPERT,
         Option(
-            None,
+            "FRACTION",
             "tolerated fraction of wrong poses among those accepted",
             "accepted as usual",
         ),
@@ -80,7 +80,7 @@ def run_track(
     images: Annotated[SeenImages, Without("split")],
     tracking: Annotated[TrackingOptions, Group("tracking", "How tracking begins, and which poses it accepts.")],
 ) -> None:
-    """Find the poses of a sequence's frames in a map, in order of time.
+    """Find the poses of a sequence's frames in a map, in chronological order.
 
     Each pose is predicted from those before it, refined and validated. A frame whose pose is not accepted counts as lost; the
     following ones are searched for in the whole map. If the sequence has true poses, a table shows the errors.

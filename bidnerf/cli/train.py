@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 from bidnerf.cli.options import (
     CameraOptions,
+    DaskAddress,
     ImageOptions,
     Json,
     MapOutput,
@@ -38,8 +40,15 @@ PoserName: TypeAlias = Annotated[
     str,
     EXPERT,
     installed("posers"),
-    Option("NAME", "program that finds the poses of photos without any, one of 'bidnerf plugins posers'"),
+    Option("NAME", "poser, which finds the poses of photos, one of 'bidnerf plugins posers'"),
 ]
+
+
+def keypoint_workers(dask: str | None) -> AbstractContextManager[None]:
+    """Return a context in which the workers of the dask scheduler at this address, if any, detect and match keypoints."""
+    from bidnerf.evaluation import cluster
+
+    return contextlib.nullcontext() if dask is None else cluster(dask)
 
 
 def run_poses(
@@ -54,6 +63,7 @@ def run_poses(
         ),
     ] = None,
     poser: PoserName = USUAL_POSER,
+    dask: DaskAddress = None,
     overwrite: Overwrite = False,
     json: Json = False,
     *,
@@ -69,7 +79,7 @@ def run_poses(
     from bidnerf_core.io import to_plain
 
     given = camera if photos_camera == CameraOptions() else photos_camera.source(camera)
-    with interruptible_work("stopping (Ctrl-C again: at once); what was found is kept"):
+    with keypoint_workers(dask), interruptible_work("stopping (Ctrl-C again: at once); what was found is kept"):
         poses = POSERS.load(poser)(photos, out, given, overwrite)
     print_result(to_plain(poses), (), json)
 
@@ -92,9 +102,9 @@ class TrainingOptions:
     """Which training, and how far it goes."""
 
     backend: Annotated[
-        str | None, installed("backends"), Option("NAME", "one of 'bidnerf backends'", USUAL_BACKEND)
+        str | None, installed("backends"), Option("NAME", "kind of field, one of 'bidnerf backends'", USUAL_BACKEND)
     ] = None
-    quick: Annotated[Flag, Option(None, "train a short time: settings of the backend for a first map")] = False
+    quick: Annotated[Flag, Option(None, "train briefly, with the backend's settings for a first map")] = False
     resume: Annotated[Flag, Option(None, "continue the interrupted training in --out")] = False
     finish: Annotated[Flag, Option(None, "end the interrupted training in --out now, with the steps done so far")] = (
         False
@@ -105,6 +115,7 @@ class TrainingOptions:
         EXPERT,
         Option("SECONDS", "time between checkpoints: the most work lost if the program is killed"),
     ] = 60.0
+    dask: DaskAddress = None
 
 
 @dataclass(frozen=True)
@@ -159,10 +170,10 @@ def run_train(
 ) -> None:
     """Build a map from a dataset, or from photos without poses.
 
-    Poses that photos or video frames lack are found first, as by 'bidnerf poses', and kept in the folder MAP-poses. The landmarks
+    Missing poses are found first, as 'bidnerf poses' does, and kept in the folder MAP-poses. The landmarks
     come next, since they localize photos on their own, then the field and the surface. Ctrl-C stops after a step and saves
     the map; --resume continues from there, or from the last checkpoint if the program was killed, with the same result as an
-    uninterrupted training, and --finish ends it as it stands. All of it takes 5 to 10 minutes on two cores for 85 to 436 images with
+    uninterrupted training, and --finish ends it as it stands. This takes 5 to 10 minutes on two cores for 85 to 436 images with
     poses, and 2 to 4 minutes of CPU time with --quick. If --out holds a map of landmarks alone, as 'bidnerf import' makes
     of a COLMAP model, it gets a field and a surface.
     """
@@ -204,8 +215,11 @@ def run_train(
         sparse_depth.model_points,
         training.checkpoint_every,
     )
-    announcement = "stopping after this step (Ctrl-C again: at once, back to the last checkpoint)"
-    with report_time(f"{out}: trained and baked" if bake else f"{out}: trained"), interruptible_work(announcement):
+    with (
+        keypoint_workers(training.dask),
+        report_time(f"{out}: trained and baked" if bake else f"{out}: trained"),
+        interruptible_work("stopping after this step (Ctrl-C again: at once, back to the last checkpoint)"),
+    ):
         if resumes:
             try:
                 scene = resume(out, data, bake=bake, finish=training.finish, options=options)

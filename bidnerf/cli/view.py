@@ -72,7 +72,7 @@ def run_view(
 ) -> None:
     """View a map, and localizations in it, in a browser.
 
-    The page shows how and why a pose was accepted or refused, also of photos that are dropped on it. Ctrl-C stops it. The photos and
+    The page shows how and why each pose was accepted or refused, including those of photos dropped on it. Ctrl-C stops it. The photos and
     frames of QUERY can be selected there. Photos dropped on the page take the camera given here, whose field of view can be changed
     there. With --save, QUERY is localized immediately, and the saved page shows the same without a server.
     """
@@ -131,7 +131,7 @@ def run_serve(
         tuple[str, ...],
         Option(
             "MAP...",
-            "folders of maps; NAME=MAP serves one under a name other than its folder's",
+            "one or more map folders; NAME=MAP serves one under a name other than its folder's",
             positional=True,
         ),
     ],
@@ -148,7 +148,7 @@ def run_serve(
     method: MethodName = USUAL_METHOD,
     device: Device = "cpu",
     *,
-    limits: Annotated[ServiceLimits, Group("limits", "What the service takes on.")],
+    limits: Annotated[ServiceLimits, Group("limits", "Limits on requests and workers.")],
 ) -> None:
     """Serve localization over HTTP: photos in, poses out.
 

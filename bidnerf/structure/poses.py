@@ -69,7 +69,7 @@ def find_poses(
     *,
     reuse: bool = False,
 ) -> FoundPoses:
-    """Find the poses of photos by structure from motion (COLMAP, extra ``sfm``), and write them as a dataset into ``out``.
+    """Find the poses of photos by structure from motion with COLMAP (extra ``sfm``), and write them as a dataset.
 
     ``photos`` is a folder of photos, or a video, from which frames are chosen by motion and sharpness and
     written as images, or a recording in a known format that has no poses, whose cameras are kept fixed. ``camera``

@@ -135,6 +135,8 @@ def test_help_names_what_is_installed(bidnerf: Run) -> None:
     for words, group in (("localize", "writers"), ("track", "writers"), ("export", "exporters")):
         page = " ".join(bidnerf(words, "--help").out.split())
         assert ", ".join(info.name for info in list_plugins(group)) in page
+    presets = "; ".join(f"{name}: {', '.join(METHODS.load(name).presets)}" for name in ("bid", "inerf"))
+    assert f"settings to begin with; {presets} (" in " ".join(bidnerf("localize", "--help-all").out.split())
 
 
 WRITTEN = {"--out", "--data", "--size"}

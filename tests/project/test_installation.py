@@ -29,7 +29,11 @@ COMMANDS = {
         "track MAP DATA --out x.tum --plot x.png",
         "report DATA/r.jsonl --out x",
     ],
-    ("cluster", "distributed"): ["evaluate MAP DATA --out x.jsonl --dask tcp://127.0.0.1:9"],
+    ("cluster", "distributed"): [
+        "evaluate MAP DATA --out x.jsonl --dask tcp://127.0.0.1:9",
+        "poses PHOTOS --out x --dask tcp://127.0.0.1:9",
+        "train PHOTOS --out x --dask tcp://127.0.0.1:9",
+    ],
     ("serve", "uvicorn"): ["serve MAP"],
     ("viewer", "uvicorn"): ["view MAP"],
     ("sfm", "pycolmap"): ["train PHOTOS --out x", "poses PHOTOS --out x"],
