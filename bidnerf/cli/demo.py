@@ -22,7 +22,9 @@ DESCENT = {"rays": 768, "max_steps": 150, "decay_steps": 60}  # faster than the 
 
 
 def run_demo(
-    backend: Annotated[str, installed("backends"), Option("NAME", "kind of field, one of 'bidnerf backends'")] = USUAL_BACKEND,
+    backend: Annotated[
+        str, installed("backends"), Option("NAME", "kind of field, one of 'bidnerf backends'")
+    ] = USUAL_BACKEND,
     out: Annotated[Path, Option("DIR", "folder for the map, the images and the pictures")] = Path("demo-out"),
     frames: Annotated[int, WholeNumbers(1), Option("N", "number of unseen frames to localize")] = 4,
     steps: Annotated[int | None, WholeNumbers(1), Option("N", "training steps", "the backend's quick choice")] = None,
