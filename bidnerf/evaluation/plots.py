@@ -27,12 +27,12 @@ from bidnerf.evaluation.summary import (
     is_right,
     situations,
     steps_of,
-    unit_of_results,
 )
 from bidnerf.evaluation.trial import TrialResult
 from bidnerf.results import (
     CRITERION_NAMES,
     common_style,
+    common_unit,
     line_style,
     new_figure,
     require_matplotlib,
@@ -135,7 +135,7 @@ class Figures:
             if reached:
                 shares = [100 * count / len(values) for count in range(len(reached) + 1)]
                 axes.step([reached[0], *reached], shares, where="post", **self.looks[group.label])
-        axes.set(xlabel=label.format(unit=unit_of_results(groups[0].results)), ylabel=share, ylim=(-2, 102))
+        axes.set(xlabel=label.format(unit=common_unit(groups[0].results)), ylabel=share, ylim=(-2, 102))
         if bound is not None:
             axes.axvline(bound, **BOUND)
         if of == "steps":
@@ -158,7 +158,7 @@ class Figures:
             axes.plot(middle, **look)
             axes.fill_between(range(longest), low, high, color=look["color"], alpha=0.14, linewidth=0)
         axes.axhline(bound, **BOUND)
-        axes.set(xlabel="step", ylabel=label.format(unit=unit_of_results(groups[0].results)))
+        axes.set(xlabel="step", ylabel=label.format(unit=common_unit(groups[0].results)))
         axes.set_xlim(left=0)
         _set_logarithmic(axes, "y")
 

@@ -27,10 +27,9 @@ from bidnerf.evaluation.summary import (
     is_right,
     number_text,
     situations,
-    unit_of_results,
 )
 from bidnerf.evaluation.trial import TrialResult, open_data, trial_views
-from bidnerf.results import CRITERIA, CRITERION_NAMES, as_picture, require_matplotlib
+from bidnerf.results import CRITERIA, CRITERION_NAMES, as_picture, common_unit, require_matplotlib
 from bidnerf.scenes import is_closed_form
 from bidnerf_core.datasets import Capture, DatasetOptions
 from bidnerf_core.errors import InputError, printable
@@ -118,7 +117,7 @@ def render_page(
     template = environment.from_string(source.strip() + "\n")
     groups = table.groups
     maps = (f"{s.map} ({s.weights.partition('.')[0]}), on {s.data}/{s.split}" for s in situations(groups))
-    unit = symbol(unit_of_results(table.rows))
+    unit = symbol(common_unit(table.rows))
     return template.render(
         mark=Markup(MARK),
         title=title,

@@ -249,6 +249,8 @@ def as_line(plain: Any) -> bytes:
 
 # How results were made: command, code and machine.
 
+CHECKOUT = Path(bidnerf_core.__file__).resolve().parents[1]
+"""The folder of the code, which is a checkout unless the package is installed."""
 RUNS = ".meta.json"
 """The ending of the file next to a results file that lists the runs that made it."""
 
@@ -319,35 +321,29 @@ def read_runs(results: Path) -> list[Provenance]:
 
 def _git(*arguments: str) -> str:
     """Return the output of a git command in this package's checkout; empty if there is no checkout or no git."""
-    root = Path(bidnerf_core.__file__).resolve().parents[1]
-    # An installed package may lie inside another project.
-    if not (root / ".git").exists():
-        return ""
-    try:
-        done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return ""
-    return done.stdout.strip()
+    if (CHECKOUT / ".git").exists():  # an installed package may lie inside another project
+        with suppress(OSError, subprocess.CalledProcessError):
+            return subprocess.check_output(
+                ["git", *arguments], cwd=CHECKOUT, stderr=subprocess.DEVNULL, text=True
+            ).strip()
+    return ""
 
 
 def _cpu_model() -> str:
     """Return the name of the processor."""
     with suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
+        if model := re.search(r"^model name\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE):
+            return model[1].strip()
     return platform.processor()
 
 
 def script_command() -> str:
     """Return the command of the running script, with paths relative to the checkout; outside it, only file names."""
-    root = Path(bidnerf_core.__file__).resolve().parents[1]
 
     def shorten(part: str) -> str:
         path = Path(part)
-        if not path.is_absolute():
-            return part
-        return str(path.relative_to(root)) if path.is_relative_to(root) else path.name
+        inside = path.relative_to(CHECKOUT) if path.is_relative_to(CHECKOUT) else path.name
+        return str(inside) if path.is_absolute() else part
 
     # Words such as ``--out=PATH`` and ``MAP:DATA`` hold paths, too.
     words = ["".join(map(shorten, re.split(r"([=:])", word))) for word in sys.argv]

@@ -12,7 +12,7 @@ from typing import Any
 
 from bidnerf.evaluation.faults import NO_FAULT
 from bidnerf.evaluation.trial import Trace, TrialResult
-from bidnerf.results import CRITERIA, Rate, Reduced, steps_to_success, success_rate_by_frame
+from bidnerf.results import CRITERIA, Rate, Reduced, common_unit, steps_to_success, success_rate_by_frame
 from bidnerf_core.errors import amount
 from bidnerf_core.geometry import LengthUnit
 
@@ -189,7 +189,7 @@ def summarize(results: Sequence[TrialResult]) -> Summary:
     return Summary(
         trials=len(results),
         frames=len({frame_label(result) for result in results}),
-        unit=unit_of_results(results),
+        unit=common_unit(results),
         success={name: success_of(results, name) for name in CRITERIA},
         translation=median(e.translation if e else None for e in errors),
         rotation_deg=median(e.rotation_deg if e else None for e in errors),
@@ -207,11 +207,6 @@ def summarize(results: Sequence[TrialResult]) -> Summary:
 def frame_label(result: TrialResult) -> tuple[str, str, tuple[str, ...]]:
     """Return the identity of a trial's images: trials of the same images are not independent."""
     return result.trial.data, result.trial.images.split, result.trial.frames
-
-
-def unit_of_results(results: Sequence[TrialResult]) -> LengthUnit:
-    """Return the unit of the errors of trials: metres if all errors are in metres."""
-    return "metres" if results and all(result.unit == "metres" for result in results) else "units"
 
 
 def applies(criterion: str, results: Sequence[TrialResult]) -> bool:

@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import sys
 import time
 from collections import Counter
@@ -171,10 +172,8 @@ def trial_views(trial: Trial, dataset: Capture) -> list[View]:
 
     The trial's faults are applied to the views, and their depth is removed if the trial withholds depth.
     """
-    views = [faulty(view, trial.fault, trial.seed) for view in dataset.views(trial.images.split, trial.frames)]
-    if trial.depth:
-        return views
-    return [View(view.frame.replace(depth=None), view.T_ref_camera) for view in views]
+    views = (faulty(view, trial.fault, trial.seed) for view in dataset.views(trial.images.split, trial.frames))
+    return [v if trial.depth else View(v.frame.replace(depth=None), v.T_ref_camera) for v in views]
 
 
 def open_map(name: str, device: str = "cpu") -> Map:
@@ -268,9 +267,8 @@ def peak_memory_bytes() -> int:
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         return int(torch.cuda.max_memory_allocated())
     with contextlib.suppress(OSError):
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024
+        if peak := re.search(r"^VmHWM:\s*(\d+)", Path("/proc/self/status").read_text(), re.MULTILINE):
+            return int(peak[1]) * 1024
     import resource  # absent on Windows
 
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

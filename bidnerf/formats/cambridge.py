@@ -68,11 +68,10 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
 
 def _find(path: Path) -> Path | None:
     """Return the first list of images, the model, or the poses of a scene whose intrinsics are listed by image too."""
-    for file, head in file_heads(path, "intrinsics.txt", "a list of cameras"):
-        words = head.partition(b"\n")[0].split()
-        if len(words) == 7 and b"." in words[0] and is_file(file.with_name("poses.txt")):
-            return file.with_name("poses.txt")
-    return first_file(path, *LISTS.values()) or next(iter(sorted(path.glob("*.nvm"))), None)
+    heads = file_heads(path, "intrinsics.txt", "a list of cameras")
+    rows = (head.partition(b"\n")[0].split() for _, head in heads)
+    by_image = ["poses.txt" for words in rows if len(words) == 7 and b"." in words[0]]
+    return first_file(path, *by_image, *LISTS.values()) or next(iter(sorted(path.glob("*.nvm"))), None)
 
 
 def _rows(file: Path, count: int) -> dict[str, Listed]:

@@ -44,11 +44,9 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
 
 
 def _find(path: Path) -> Path | None:
-    for file, head in file_heads(path, "*.csv", "a list of cameras"):
-        names = column_names(head.partition(b"\n")[0].decode("utf-8-sig", "replace"))
-        if names[:1] == ["name"] and set(POSE_FIELDS) <= set(names):
-            return file
-    return None
+    heads = file_heads(path, "*.csv", "a list of cameras")
+    tables = ((file, column_names(head.partition(b"\n")[0].decode("utf-8-sig", "replace"))) for file, head in heads)
+    return next((file for file, names in tables if names[:1] == ["name"] and set(POSE_FIELDS) <= set(names)), None)
 
 
 def file_heads(path: Path, pattern: str, expected: str) -> Iterator[tuple[Path, bytes]]:

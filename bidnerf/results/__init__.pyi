@@ -39,6 +39,7 @@ from .plots import write_figure as write_figure
 from .pose_files import OPENCV_AXES as OPENCV_AXES
 from .pose_files import LandmarkMatches as LandmarkMatches
 from .pose_files import PosedImage as PosedImage
+from .pose_files import common_unit as common_unit
 from .pose_files import pose_entries as pose_entries
 from .pose_files import pose_format as pose_format
 from .pose_files import pose_of as pose_of

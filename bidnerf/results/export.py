@@ -205,10 +205,9 @@ def ply(columns: dict[str, Tensor], comments: list[str], faces: np.ndarray | Non
 def head(scene: Map, images: Sequence[PosedImage], what: str) -> list[str]:
     """Return the header comments of a file: content, unit of lengths, up direction, and frame of the images."""
     lengths = "metres" if scene.unit == "metres" else "units of unknown length"
-    lines = ["written by bidnerf", what, f"lengths in {lengths}"]
-    if scene.up is not None:
-        lines.append(f"up is {' '.join(f'{x:.6f}' for x in scene.up.direction)}, by {scene.up.source}")
-    return [*lines, frame_of(images)] if images else lines
+    up = "" if scene.up is None else f"up is {' '.join(f'{x:.6f}' for x in scene.up.direction)}, by {scene.up.source}"
+    lines = ("written by bidnerf", what, f"lengths in {lengths}", up, frame_of(images) if images else "")
+    return [line for line in lines if line]
 
 
 def _colours(scene: Map, landmarks: LandmarkMap) -> Float[Tensor, "n 3"]:

@@ -94,9 +94,9 @@ class PosedImage:
         return replace(self, intrinsics=stored, T_world_camera=self.pose @ T_upright_stored, matches=matches)
 
 
-def common_unit(images: Sequence[PosedImage]) -> LengthUnit:
-    """Return the unit of the positions: metres only if all are metric."""
-    return "metres" if images and all(image.unit == "metres" for image in images) else "units"
+def common_unit(parts: Sequence[Any]) -> LengthUnit:
+    """Return the unit of the lengths of images or results, each of which has a ``unit``: metres only if all are metric."""
+    return "metres" if parts and all(part.unit == "metres" for part in parts) else "units"
 
 
 def frame_of(images: Sequence[PosedImage], direction: str = "camera to world") -> str:

@@ -77,8 +77,7 @@ class CommandContract(Named):
 
     def _run(self, *words: str) -> tuple[int, str, str]:
         """Run the command, and return its exit status and what it printed on stdout and stderr."""
-        require(type(self).__name__, (self.name != "", "no name, expected the one that is registered"))
         out, err = io.StringIO(), io.StringIO()
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            status = main([self.name, *words])
+            status = self._part(lambda name: main([name, *words]))
         return status, out.getvalue(), err.getvalue()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 import json
@@ -253,7 +254,7 @@ def frozen(field: Any) -> Any:
 
 def precise(field: RadianceField) -> tuple[RadianceField, torch.dtype]:
     """Return a float64 copy of the field if it supports that dtype, else the field itself, and the dtype to use."""
-    try:
+    with contextlib.suppress(Exception):  # ``test_query_follows_the_dtype`` reports it
         doubled: Any = copy.deepcopy(field)
         # A level need not be a module itself; then the modules that it holds are converted.
         for part in [doubled] if isinstance(doubled, nn.Module) else vars(doubled).values():
@@ -262,8 +263,6 @@ def precise(field: RadianceField) -> tuple[RadianceField, torch.dtype]:
         positions, directions = (x.double() for x in points(2))
         if query(doubled, positions, directions, "points").density.dtype == torch.float64:
             return doubled, torch.float64
-    except Exception:  # ``test_query_follows_the_dtype`` reports it
-        pass
     return field, torch.float32
 
 

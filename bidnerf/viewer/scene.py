@@ -180,13 +180,11 @@ def _subset(count: int, most: int) -> Tensor:
 
 def _framing(scene: Map) -> tuple[Sequence[float], float]:
     """Return the centre of a scene, and the size that encloses most of it, in the unit of the map."""
-    if scene.surface is not None and len(scene.surface.surfels):
-        points = scene.surface.surfels.positions
-    elif scene.landmarks is not None and len(scene.landmarks):
-        points = scene.landmarks.positions
-    else:
+    parts = (None if scene.surface is None else scene.surface.surfels, scene.landmarks)
+    clouds = [part.positions for part in parts if part is not None and len(part)]
+    if not clouds:
         return scene.bounds.centre, max(scene.bounds.size)
-    points = points[_subset(len(points), 20_000)].cpu().double()
+    points = clouds[0][_subset(len(clouds[0]), 20_000)].cpu().double()
     if scene.info.cameras:  # weighted so that all cameras together count as a hundredth of the points
         places = poses_of(scene.info.cameras).translation
         points = torch.cat([points, places.repeat(1 + len(points) // (100 * len(places)), 1)])
