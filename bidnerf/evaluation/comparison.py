@@ -170,8 +170,9 @@ def compare(
             device = device_name(sources[name], plan.device)
             trial = replace(start, map=name if name in here else str(sources[name]), device=device)
             try:
-                running = executors[name].submit(run_trial, trial, here.get(name), registered_for(trial))
-                results[name].append(running.result())
+                results[name].append(
+                    executors[name].submit(run_trial, trial, here.get(name), registered_for(trial)).result()
+                )
             except BrokenProcessPool as error:
                 raise InputError(
                     f"the process that localized frame {trial.frame} ended",

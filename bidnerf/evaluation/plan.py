@@ -168,8 +168,10 @@ class Setup:
         files = {name: getattr(self, name, None) for name in ("map", "data")} | images  # ``Trial`` alone has a map
         for name, value in files.items():
             if not isinstance(value, str | float | int | None):
-                expected = "text, a number or the path of a file, since trials are written as JSON"
-                raise InputError(f"{name} is a {type(value).__name__}", expected=expected)
+                raise InputError(
+                    f"{name} is a {type(value).__name__}",
+                    expected="text, a number or the path of a file, since trials are written as JSON",
+                )
             if name != "split" and "\0" in str(value):
                 raise InputError(f"{name} holds a NUL character", expected="the name of a file or folder")
 

@@ -147,8 +147,14 @@ def worst_first(rows: Sequence[TrialResult]) -> list[TrialResult]:
     Wrongly accepted trials (beyond 5 degrees or 0.05 units) come first, then the refused ones, then the others;
     each kind is sorted by decreasing error.
     """
-    errors = {id(row): math.inf if row.error is None else row.error.translation for row in rows}
-    return sorted(rows, key=lambda row: (row.converged and is_right(row), not row.converged, -errors[id(row)]))
+    return sorted(
+        rows,
+        key=lambda row: (
+            row.converged and is_right(row),
+            not row.converged,
+            -math.inf if row.error is None else -row.error.translation,
+        ),
+    )
 
 
 def add_images(rows: Sequence[TrialResult], data: Sequence[str | Path]) -> list[tuple[TrialResult, str | None]]:

@@ -37,8 +37,11 @@ def check_pose_file(path: Path) -> None:
         return
     for beside in (path.with_name("cameras.txt"), path.with_name("points3D.txt")):
         if beside.exists() and HEAD not in beside.read_text(errors="replace")[:100]:
-            expected = f"{path.name} in a folder without another model"
-            raise InputError("would be replaced, since a COLMAP model has one;", where=beside, expected=expected)
+            raise InputError(
+                "would be replaced, since a COLMAP model has one;",
+                where=beside,
+                expected=f"{path.name} in a folder without another model",
+            )
 
 
 def write_colmap_poses(path: Path, images: Sequence[PosedImage], refused: Sequence[str] = ()) -> None:

@@ -119,8 +119,11 @@ def _queries(localizer: Localizer | MapCollection, given: Any) -> QuerySource:
     for each in listed:
         rig = [View(each, SE3.identity())] if isinstance(each, Frame) else [each] if isinstance(each, View) else each
         if not isinstance(rig, list | tuple) or not rig or not all(isinstance(view, View) for view in rig):
-            expected = "photos by path, or a Frame, View or list of Views for each"
-            raise InputError(f"got a {type(each).__name__}", where="queries", expected=expected)
+            raise InputError(
+                f"got a {type(each).__name__}",
+                where="queries",
+                expected="photos by path, or a Frame, View or list of Views for each",
+            )
         rigs.append(tuple(rig))
     return _Rigs(rigs)
 

@@ -77,9 +77,7 @@ class PosedImage:
         Without a file and an orientation, the image is returned as it is. Raises ``InputError`` for a photo
         stored mirrored, for which no rigid pose exists.
         """
-        orientation = self.orientation
-        if orientation is None:
-            orientation = UPRIGHT if self.file is None else read_exif(self.file).orientation
+        orientation = self.orientation or (UPRIGHT if self.file is None else read_exif(self.file).orientation)
         if orientation == UPRIGHT:
             return self
         if float(torch.linalg.det(orientation.axes)) < 0:
@@ -116,9 +114,8 @@ def time_stamps(images: Sequence[PosedImage]) -> tuple[list[tuple[float, PosedIm
     """
     times = dict[float, PosedImage]()
     for image in images:
-        time = image.time
-        if time is None and re.fullmatch(r"\d+\.\d+", image.name):
-            time = float(image.name)
+        is_time = image.time is None and re.fullmatch(r"\d+\.\d+", image.name)
+        time = float(image.name) if is_time else image.time
         if time is not None:
             times[round(time, 6)] = image
     are_times = len(times) == len(images)
@@ -174,9 +171,8 @@ def write_pose_transforms(path: Path, images: Sequence[PosedImage], **more: Any)
     """
     frames = []
     for image in images:
-        stored, file = image.as_stored, image.name
-        if image.file is not None:
-            file = os.path.relpath(image.file.resolve(), path.parent.resolve())
+        stored, folder = image.as_stored, path.parent.resolve()
+        file = image.name if image.file is None else os.path.relpath(image.file.resolve(), folder)
         frames.append(frame_entry(Path(file).as_posix(), image.name, stored.intrinsics, stored.pose, image.time))
     content = {"camera_model": "OPENCV", "unit": common_unit(images), "frames": frames, **more}
     write_file(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
@@ -219,8 +215,11 @@ def write_poses(path: str | Path, images: Sequence[PosedImage], refused: Sequenc
     path = Path(path)
     is_list = isinstance(images, Sequence)
     if odd := [image for image in images if not isinstance(image, PosedImage)] if is_list else [images]:
-        expected = "a list of PosedImage(name, number, intrinsics, T_world_camera)"
-        raise InputError(f"got a {type(odd[0]).__name__}", where=path, expected=expected)
+        raise InputError(
+            f"got a {type(odd[0]).__name__}",
+            where=path,
+            expected="a list of PosedImage(name, number, intrinsics, T_world_camera)",
+        )
     ending = pose_format(path)
     write: Any = POSE_WRITERS[ending]
     more = {"refused": refused} if "refused" in inspect.signature(write).parameters else {}

@@ -40,9 +40,8 @@ def track(
     """
     if every < 1:
         raise InputError(f"every is {every}", expected="1 or more")
-    tracker = scene
-    if not isinstance(tracker, Tracker):
-        tracker = Tracker(tracker if isinstance(tracker, Localizer) else Localizer(tracker))
+    localizer = scene if isinstance(scene, Localizer | Tracker) else Localizer(scene)
+    tracker = localizer if isinstance(localizer, Tracker) else Tracker(localizer)
     if not isinstance(sequence, Capture):
         stored = tracker.localizer.scene
         sequence = open_sequence(sequence, assumed=landmark_cameras(stored), background=stored.bounds.background)
