@@ -145,7 +145,7 @@ def test_a_camera_in_the_folder_is_that_of_the_images(scene: Path) -> None:
         ("", "", "lists no sequences", "lines such as sequence1"),
         ("sequence2\nsequence7", ": line 2", "no folder for sequence7", "seq-07"),
         ("the second", "", "line 1: 'the second'", "a sequence such as sequence1"),
-        ("sequence" + 5000 * "1", "", "line 1: 'sequence1111", "a sequence such as sequence1"),
+        ("sequence" + 5000 * "1", "", "line 1: 'sequence" + 32 * "1" + "'", "a sequence such as sequence1"),
     ],
 )
 def test_broken_split_files_name_the_line(text: str, line: str, found: str, expected: str, scene: Path) -> None:

@@ -253,12 +253,14 @@ def test_an_earlier_pose_by_landmarks_is_told_from_the_pose_found(
     room: Map, query: Query, answer: Localization, record: SearchRecord
 ) -> None:
     here = answer_json(room, "here", answer, query.frame, record)
-    assert {figure.pose for figure in here["figures"]} == {here["matches"]["pose"] if here["matches"] else None} == {""}
+    assert (
+        {figure["pose"] for figure in here["figures"]} == {here["matches"]["pose"] if here["matches"] else None} == {""}
+    )
     away = replace(answer.T_world_camera, translation=answer.T_world_camera.translation + 1.0)
     given_up = replace(answer, T_world_camera=away, diagnostics=None, confidence=None)
     there = answer_json(room, "there", given_up, query.frame, record)
     assert (
-        {figure.pose for figure in there["figures"]}
+        {figure["pose"] for figure in there["figures"]}
         == {there["matches"]["pose"] if there["matches"] else None}
         == {EARLIER}
     )
@@ -362,7 +364,7 @@ def test_a_localization_of_an_earlier_run_is_shown_without_its_frame(
     shown = answer_json(room, "earlier", Localization.load(tmp_path / "pose.json"))
     assert shown["accepted"]
     assert shown["rendered"] is None
-    assert shown["figures"][0].name == "confidence"
+    assert shown["figures"][0]["name"] == "confidence"
 
 
 def test_what_is_no_map_or_cannot_be_localized_is_refused(room: Map, query: Query) -> None:
