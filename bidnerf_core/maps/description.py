@@ -119,8 +119,8 @@ class MapInfo:
         if self.complete:
             return None
         if not self.step:
-            return "the training of its field has not begun; 'bidnerf train --resume' begins it"
-        return f"its training stopped at step {self.step}; 'bidnerf train --resume' continues it"
+            return "the training of its field has not begun; 'bidnerf train DATA --out MAP --resume' begins it"
+        return f"its training stopped at step {self.step}; 'bidnerf train DATA --out MAP --resume' continues it"
 
     def scaled(self, factor: float, unit: LengthUnit) -> MapInfo:
         """Return the description of the map scaled by ``factor``, with lengths in ``unit``; the weights keep the unit of training."""
