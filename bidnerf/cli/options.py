@@ -153,12 +153,11 @@ def refuse(options: Mapping[str, object], reason: str, expected: str | None = No
 
 def require_device(device: str) -> None:
     """Raise ``UsageError`` if a device does not work here."""
-    if device == "cpu":  # which needs no torch to be known
-        return
-    from bidnerf_core.devices import working_device
+    if device != "cpu":  # which works without a question to torch
+        from bidnerf_core.devices import working_device
 
-    with wrong_usage():
-        working_device(device)
+        with wrong_usage():
+            working_device(device)
 
 
 def require_inputs(*paths: Path | None) -> None:

@@ -67,10 +67,14 @@ def run_doctor(json: Json = False) -> None:
         rows = [[name, str(found[name])] for name in ("bidnerf", "python", "platform")]
         rows += [["device", device] for device in found["devices"]]
         rows += [[requirement.name, requirement.installed or "missing"] for requirement in needed]
-        for name, unmet in extras.items():
-            outdated = ", ".join(str(each) for each in unmet if each.installed)
-            absent = f"not installed; pip install 'bidnerf[{name}]' adds it"
-            rows.append([f"extra {name}", "installed" if not unmet else outdated or absent])
+        rows += [
+            [
+                f"extra {name}",
+                (", ".join(str(each) for each in unmet if each.installed) if unmet else "installed")
+                or f"not installed; pip install 'bidnerf[{name}]' adds it",
+            ]
+            for name, unmet in extras.items()
+        ]
         for name, text in [*rows, *(["plugin", text] for text in plugins)]:
             show(f"{name:<22}  {text}")  # a line each at any width of the terminal, since it is pasted into reports
     if broken:

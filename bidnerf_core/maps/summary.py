@@ -95,7 +95,9 @@ class MapSummary:
         field = "none; landmarks alone localize photos"
         built = "none"
         if info.step:
-            state = "complete" if info.complete else "not complete; 'bidnerf train DATA --out MAP --resume' continues it"
+            state = (
+                "complete" if info.complete else "not complete; 'bidnerf train DATA --out MAP --resume' continues it"
+            )
             training = f"{info.step} steps of backend {info.backend} in {duration_text(info.seconds)}, {state}"
             field = f"{amount(facts['parameters'], 'parameter')} in {amount(facts['levels'], 'level')}"
             if info.colour_noise is not None:
