@@ -110,8 +110,8 @@ def pose_contradiction(images: Sequence[ImageKeypoints]) -> PoseContradiction | 
     disputes = [{pair.first, pair.second} for pair, agreed in zip(pairs, agrees, strict=True) if not agreed]
     nearby = [match_pair(images, i, j) for i, j in near if any({i, j} & both for both in disputes)]
     sound = {i for pair in nearby if pair and bool(pair.agreeing(poses[None])[0]) for i in (pair.first, pair.second)}
-    alike = sum(both <= sound for both in disputes)
-    return PoseContradiction(len(pairs), as_given) if as_given < 0.5 * (len(pairs) - alike) else None
+    conclusive = len(pairs) - sum(both <= sound for both in disputes)
+    return PoseContradiction(len(pairs), as_given) if as_given < 0.5 * conclusive else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,8 +160,10 @@ def _similar(images: Sequence[ImageKeypoints]) -> list[tuple[int, int]]:
     """
     chosen = range(0, len(images), max(1, -(-len(images) // 60)))
     strongest = [images[i].keypoints.descriptors[:300] for i in chosen]
-    pairs = itertools.combinations(range(len(chosen)), 2)
-    counts = {(a, b): len(_unambiguous(strongest[a], strongest[b])[0]) for a, b in pairs}
+    counts = {
+        (a, b): len(_unambiguous(strongest[a], strongest[b])[0])
+        for a, b in itertools.combinations(range(len(chosen)), 2)
+    }
     selected = set[tuple[int, int]]()
     for number in range(len(chosen)):
         own = sorted((pair for pair in counts if number in pair), key=lambda pair: -counts[pair])
@@ -203,7 +205,8 @@ def match_pair(images: Sequence[ImageKeypoints], i: int, j: int) -> MatchedPair 
 @cache
 def readings(count: int) -> tuple[Reading, ...]:
     """Return the readings to try for ``count`` poses, most common first: of readings that fit equally well, the first is preferred."""
-    return (*_of_axes(), *_of_parts(), *_of_quaternions(), *_of_worlds(), *_of_positions(), *_of_orders(count))
+    of_parts = itertools.chain.from_iterable(_in_file_axes(*part) for part in POSE_PARTS)
+    return (*_of_axes(), *of_parts, *_of_quaternions(), *_of_worlds(), *_of_positions(), *_of_orders(count))
 
 
 def reinterpret(
@@ -244,65 +247,59 @@ def _of_axes() -> Iterator[Reading]:
         )
 
 
-Part = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-POSE_PARTS: tuple[tuple[Part, str, str], ...] = (
+POSE_PARTS: tuple[tuple[str, str, Callable[[SE3], SE3]], ...] = (
     (
-        lambda R, t: (R.mT, t),
         "their rotations are transposed, while their positions are right",
         "transpose the upper left 3x3 of each",
+        lambda T: SE3(T.rotation.mT, T.translation),
     ),
     (
-        lambda R, t: (R, -t),
         "their positions are negated",
         "multiply the first three numbers of the fourth column of each by -1",
+        lambda T: SE3(T.rotation, -T.translation),
     ),
     (
-        lambda R, t: (R, -R @ t),
         "their translations are those of inverses, while their rotations are not",
         "replace each translation t by -R t",
+        lambda T: SE3(T.rotation, -T.rotate(T.translation)),
     ),
     (
-        lambda R, t: (R.mT, -t),
         "their rotations are transposed and their positions negated",
         "transpose the upper left 3x3 of each, and negate the fourth column",
+        lambda T: SE3(T.rotation.mT, -T.translation),
     ),
     (
-        lambda R, t: (R.mT, R.mT @ t),
         "they are inverses whose translations lack the minus sign",
         "transpose each rotation R, and replace t by R^T t",
+        lambda T: SE3(T.rotation.mT, -T.inverse().translation),
     ),
     (
-        lambda R, t: (R, -R.mT @ t),
         "their translations are -R times the positions",
         "replace each translation t by -R^T t",
+        lambda T: SE3(T.rotation, T.inverse().translation),
     ),
     (
-        lambda R, t: (R, R @ t),
         "their translations are those of inverses without the minus sign, while their rotations are not",
         "replace each translation t by R t",
+        lambda T: SE3(T.rotation, T.rotate(T.translation)),
     ),
-    (lambda R, t: (R, R.mT @ t), "their translations are R times the positions", "replace each translation t by R^T t"),
     (
-        lambda R, t: (R.mT, R @ t),
+        "their translations are R times the positions",
+        "replace each translation t by R^T t",
+        lambda T: SE3(T.rotation, -T.inverse().translation),
+    ),
+    (
         "their rotations are transposed, and their translations rotated",
         "transpose each rotation R, and replace t by R t",
+        lambda T: SE3(T.rotation.mT, T.rotate(T.translation)),
     ),
     (
-        lambda R, t: (R.mT, -R @ t),
         "their rotations are transposed, and their translations rotated and negated",
         "transpose each rotation R, and replace t by -R t",
+        lambda T: SE3(T.rotation.mT, -T.rotate(T.translation)),
     ),
 )
-"""For each mistake, the true rotation and position (a column) as functions of the given ones, what is wrong, and the remedy."""
-
-
-def _of_parts() -> Iterator[Reading]:
-    def understand(T: SE3, part: Part) -> SE3:
-        rotation, position = part(T.rotation, T.translation[..., None])
-        return SE3(rotation, position[..., 0])
-
-    for part, clause, remedy in POSE_PARTS:
-        yield from _in_file_axes(clause, remedy, partial(understand, part=part))
+"""Mistakes in a part of each pose: what is wrong, the remedy, and the true poses as a function of the given ones."""
 
 
 def _of_quaternions() -> Iterator[Reading]:
@@ -368,9 +365,8 @@ def _of_orders(count: int) -> Iterator[Reading]:
     for first in (0, 1):
         by_text = sorted(range(count), key=lambda i, first=first: str(i + first))  # type: ignore[misc]
         text, numeric = "in text order (1, 10, 11, 2)", "in numeric order"
-        inverse = sorted(range(count), key=by_text.__getitem__)
         orders += [
-            (f"they are {text}, while the images are {numeric}", inverse),
+            (f"they are {text}, while the images are {numeric}", sorted(range(count), key=by_text.__getitem__)),
             (f"they are {numeric}, while the images are {text}", by_text),
         ]
     for clause, order in orders:
