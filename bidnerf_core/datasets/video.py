@@ -36,8 +36,7 @@ class Video:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with open_binary(path, "a video file"):
-            pass
+        open_binary(path, "a video file").close()
         with _open_stream(path) as (container, stream):
             self.size = int(stream.codec_context.width), int(stream.codec_context.height)
             found = [packet for packet in container.demux(stream) if packet.pts is not None]
@@ -82,7 +81,12 @@ class Video:
         try:
             # Phones write a key frame about once a second: decoding on is as fast as seeking up to about 90 frames.
             if self._open is None or not self._next <= number <= self._next + 90:
-                self._seek(number)
+                self.close()
+                self._open = ExitStack()
+                container, stream = self._open.enter_context(_open_stream(self.path))
+                if number:
+                    container.seek(self._stamps[number], stream=stream, backward=True)  # to the key frame before it
+                self._decoded = container.decode(stream)
             for picture in self._decoded:
                 if picture.pts is not None and picture.pts >= self._stamps[number]:
                     self._next = number + 1
@@ -93,15 +97,6 @@ class Video:
         raise BreaksOff(
             f"breaks off at frame {number} ({reason(why)})", where=self.path, expected="a complete video file"
         ) from why
-
-    def _seek(self, number: int) -> None:
-        """Seek to the key frame before a frame."""
-        self.close()
-        self._open = ExitStack()
-        container, stream = self._open.enter_context(_open_stream(self.path))
-        if number:
-            container.seek(self._stamps[number], stream=stream, backward=True)
-        self._decoded = container.decode(stream)
 
     def __getstate__(self) -> dict[str, Any]:
         """Exclude the open file, which another process cannot use, from the pickled state."""

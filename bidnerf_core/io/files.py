@@ -146,21 +146,17 @@ def lock(path: Path) -> Iterator[None]:
 
     Raises ``FileInUse`` if another process holds the lock, or held it and removed the file or folder.
     """
-    used = FileInUse("another bidnerf process is writing here; name another place, or wait until it ends", where=path)
-    try:
-        number = os.open(path, os.O_RDONLY)
-    except FileNotFoundError as error:
-        raise used from error
-    try:
-        try:
+    taken = False
+    with contextlib.ExitStack() as opened:
+        with contextlib.suppress(FileNotFoundError):  # the process that held the lock removed the folder
+            number = os.open(path, os.O_RDONLY)
+            opened.callback(os.close, number)
             taken = take_lock(number) and os.path.samestat(os.fstat(number), path.stat())
-        except FileNotFoundError:  # the process that held the lock removed the folder
-            taken = False
         if not taken:
-            raise used
+            raise FileInUse(
+                "another bidnerf process is writing here; name another place, or wait until it ends", where=path
+            )
         yield
-    finally:
-        os.close(number)
 
 
 def take_lock(number: int) -> bool:

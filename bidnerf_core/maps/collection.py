@@ -99,10 +99,28 @@ class MapCollection:
         self._infos = {
             name: scene.info if isinstance(scene, Map) else load_info(scene) for name, scene in self._maps.items()
         }
-        self._pooled_views: dict[str, Float[Tensor, "v p"]] = {}
-        self._vocabularies: dict[tuple[str, int], Vocabulary] = {}
+        landmarks: dict[str, LandmarkMap] = {}
         with job_context(progress, cancel):
-            self._key = self._index()
+            count = counter("reading", "maps")
+            for number, (name, scene) in enumerate(self._maps.items(), start=1):
+                check_cancelled("reading maps")
+                found = scene.landmarks if isinstance(scene, Map) else read_part(scene, self._infos[name], "landmarks")
+                if found is not None and len(found):
+                    landmarks[name] = found.to("cpu")
+                count(number, len(self._maps))
+        # The detector and the length of the descriptors of each map with landmarks, a vocabulary for each pair of them, and
+        # the pooled descriptors of each map.
+        self._key = {name: (found.features, found.descriptors.shape[1]) for name, found in landmarks.items()}
+        self._vocabularies = {
+            key: Vocabulary.of([found.descriptors for name, found in landmarks.items() if self._key[name] == key])
+            for key in dict.fromkeys(self._key.values())
+        }
+        self._pooled_views = {
+            name: pool_views(self._vocabularies[self._key[name]], found, cameras_of(self._infos[name]))
+            for name, found in landmarks.items()
+        }
+        if bare := [name for name in self._maps if name not in landmarks]:
+            log.info(f"{amount(len(bare), 'map')} without landmarks, tried last: {', '.join(bare)}")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -181,26 +199,6 @@ class MapCollection:
             why, losses = Verdict(Outcome.TOO_FEW_MATCHES, str(error)), torch.zeros(0, dtype=torch.float64)
             return Localization.of(why, SE3.unknown()[None], losses, self.method, time.perf_counter(), math.nan)
         return replace(found, unit=unit_of(localizer.scene)).translated(origin_of(localizer.scene))
-
-    def _index(self) -> dict[str, tuple[str, int]]:
-        """Pool the descriptors of all maps; return the detector and descriptor length of each map with landmarks."""
-        count, landmarks = counter("reading", "maps"), dict[str, LandmarkMap]()
-        for number, (name, scene) in enumerate(self._maps.items(), start=1):
-            check_cancelled("reading maps")
-            found = scene.landmarks if isinstance(scene, Map) else read_part(scene, self._infos[name], "landmarks")
-            if found is not None and len(found):
-                landmarks[name] = found.to("cpu")
-            count(number, len(self._maps))
-        keys = {name: (found.features, found.descriptors.shape[1]) for name, found in landmarks.items()}
-        for key in dict.fromkeys(keys.values()):
-            self._vocabularies[key] = Vocabulary.of(
-                [found.descriptors for name, found in landmarks.items() if keys[name] == key]
-            )
-        for name, found in landmarks.items():
-            self._pooled_views[name] = pool_views(self._vocabularies[keys[name]], found, cameras_of(self._infos[name]))
-        if bare := [name for name in self._maps if name not in landmarks]:
-            log.info(f"{amount(len(bare), 'map')} without landmarks, tried last: {', '.join(bare)}")
-        return keys
 
 
 def maps_in(folder: Path) -> list[Path]:

@@ -33,10 +33,9 @@ from bidnerf_core.mapping import (
     detect,
     find_features,
     matches_of_points,
-    surface_of_points,
     track_views,
 )
-from bidnerf_core.maps.description import MapInfo, cameras_of
+from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.maps.importers import ImportedField, Structure, bounds_about, importer_of, robust_box
 from bidnerf_core.maps.map import Map
 from bidnerf_core.maps.store import build_frozen_field, map_folder
@@ -130,12 +129,11 @@ def import_map(
         bounds = found.bounds
         if read is not None and read.source and any(view.frame.alpha is not None for view in views):
             bounds = replace(bounds, background=read.background)  # over which its images were composited
-        step = max(1, found.steps)  # 0 would mean a map without a field
         info = MapInfo(
             found.backend,
             to_plain(found.config, "config"),
             bounds,
-            step,
+            max(1, found.steps),  # 0 would mean a map without a field
             True,
             path.name,
             landmark_features=options.features,
@@ -165,7 +163,15 @@ def import_map(
                     stacklevel=2,
                 )
         if baking is not None:
-            scene = _bake(scene, found, views, baking)
+            tracked = None
+            if views or found.is_coloured:
+                if not views:
+                    log.info(
+                        f"{path.name}: landmarks are from rendered images, which match photos less well; `photos` builds"
+                        " them from photos, as in training"
+                    )
+                scene, tracked = scene.with_landmarks(views, not views)
+            scene = bake_if_possible(scene, views, baking, found.surface).with_survey(views, tracked)
         # Written once all of it is there: a map that lacks its landmarks would pass for a complete one.
         return scene if folder is None else scene.write_to(folder)
 
@@ -268,10 +274,10 @@ def _report_extent(found: ImportedField, where: str, unit: LengthUnit) -> None:
     log.info(f"{where}: extent {extent}{' metres' if unit == 'metres' else unknown}")
     # The longest side of a plausible scene is between 5 cm and 500 m; other lengths are probably in another unit.
     if not 0.05 <= max(size) <= 500:
-        large = "very large in metres; are its lengths millimetres?"
-        tiny = "tiny in metres; are its lengths kilometres or an arbitrary unit?"
-        doubt = f"{extent} would be {large if max(size) > 500 else tiny}"
-        warnings.warn(f"{where}: {doubt} `scale` changes them", InputWarning, stacklevel=3)
+        doubt = "tiny in metres; are its lengths kilometres or an arbitrary unit?"
+        if max(size) > 500:
+            doubt = "very large in metres; are its lengths millimetres?"
+        warnings.warn(f"{where}: {extent} would be {doubt} `scale` changes them", InputWarning, stacklevel=3)
 
 
 @torch.no_grad()
@@ -287,30 +293,6 @@ def ratio_to_measured_depth(field: RadianceField, bounds: SceneBounds, views: Se
     if int(both.sum()) < 200:
         return None
     return float((pixels.distance[both] * seen.opacity[both] / seen.distance[both]).median())
-
-
-def _bake(scene: Map, found: ImportedField, views: Sequence[View], config: BakeConfig) -> Map:
-    name, tracked = scene.info.data, None
-
-    def with_surface(scene: Map) -> Map:
-        surface = None
-        if found.surface is not None:
-            surface = surface_of_points(*found.surface, scene.bounds, cameras_of(scene.info), config)
-            log.info(
-                f"{name}: surface of {len(surface.surfels)} surfels from its own points, in cells with a side of"
-                f" {surface.cell:.3g}, {surface.mebibytes:.1f} MiB"
-            )
-        return scene.with_surface(views, config, surface)
-
-    if not views and found.is_coloured:
-        log.info(
-            f"{name}: landmarks are from rendered images, which match photos less well; `photos` builds them from photos,"
-            " as in training"
-        )
-    if views or found.is_coloured:
-        scene, tracked = scene.with_landmarks(views, not views)
-    scene = bake_if_possible(scene, with_surface)
-    return scene if tracked is None else scene.with_survey(views, tracked)
 
 
 def viewpoints(

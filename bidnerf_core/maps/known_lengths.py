@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.captures import StoredCamera
+from bidnerf_core.datasets import numbers_in
 from bidnerf_core.errors import InputError, spelling_hint
 from bidnerf_core.fields import (
     device_of,
@@ -95,14 +96,12 @@ def locate_point(scene: Map, point: Place) -> Float[Tensor, "3"]:
         return camera.pose.translation + origin_of(scene)
     name, at, pixel = point.rpartition("@")
     numbers = list[float]()
-    with contextlib.suppress(ValueError):
-        numbers = [float(word) for word in pixel.split(",")]
-    if not all(map(math.isfinite, numbers)):
-        numbers = []
-    if at and len(numbers) == 2 and (camera := _camera_of(scene, name)) is not None:
-        return _seen_at(scene, camera, numbers[0], numbers[1]) + origin_of(scene)
-    if not at and len(numbers) == 3:
+    with contextlib.suppress(InputError):
+        numbers = numbers_in(point, pixel, 2 if at else 3)
+    if numbers and not at:
         return torch.tensor(numbers, dtype=torch.float64)
+    if numbers and (camera := _camera_of(scene, name)) is not None:
+        return _seen_at(scene, camera, *numbers) + origin_of(scene)
     missing, names = name if at else point, [camera.name for camera in scene.info.cameras]
     if not names:
         raise InputError(f"no place {point!r} in the map: it has no cameras; expected coordinates X,Y,Z")

@@ -81,11 +81,15 @@ class Localizer:
         if config is None or isinstance(config, Mapping):
             config = settings_of(method, dict(config or {}), preset=preset)
         elif not isinstance(config, self._method.config_type):
-            takes = f"a {self._method.config_type.__name__} or a dictionary"
-            raise InputError(f"method {method!r} takes {takes}, got a {type(config).__name__}")
+            raise InputError(
+                f"method {method!r} takes a {self._method.config_type.__name__} or a dictionary, got a"
+                f" {type(config).__name__}"
+            )
         elif preset is not None:
-            both = f"both preset {preset!r} and a {type(config).__name__}"
-            raise InputError(f"got {both}", expected="one, or a dictionary of what differs")
+            raise InputError(
+                f"got both preset {preset!r} and a {type(config).__name__}",
+                expected="one, or a dictionary of what differs",
+            )
         self.config = config
         landmarks = self.scene.landmarks if self._method.uses_landmarks else None
         self.matcher = None if landmarks is None else LandmarkMatcher(landmarks)
@@ -291,8 +295,10 @@ def start_pose(start: Start, what: str = "start") -> SE3:
     if isinstance(start, SE3):
         shapes = tuple(start.rotation.shape), tuple(start.translation.shape)
         if shapes != ((3, 3), (3,)):
-            found = f"{what} has a rotation and a translation of shapes {shapes[0]} and {shapes[1]}"
-            raise InputError(found, expected="one pose: (3, 3) and (3)")
+            raise InputError(
+                f"{what} has a rotation and a translation of shapes {shapes[0]} and {shapes[1]}",
+                expected="one pose: (3, 3) and (3)",
+            )
         return SE3(start.rotation.detach(), start.translation.detach()).to("cpu", torch.float64)
     if isinstance(start, torch.Tensor):
         start = start.detach().cpu()

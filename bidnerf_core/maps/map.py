@@ -11,7 +11,8 @@ from functools import cached_property
 from pathlib import Path
 
 import torch
-from torch import nn
+from jaxtyping import Float
+from torch import Tensor, nn
 
 from bidnerf_core.captures import (
     CaptureReport,
@@ -51,6 +52,7 @@ from bidnerf_core.mapping import (
     colour_noise,
     find_features,
     render_views,
+    surface_of_points,
     track_views,
     update_scatter,
 )
@@ -62,7 +64,6 @@ from bidnerf_core.maps.store import (
     load_state,
     map_folder,
     read_part,
-    read_parts,
     with_images,
     with_tracks_in,
     write_parts,
@@ -340,28 +341,33 @@ class Map:
             )
         return replace(self, info=info).with_parts(None, landmarks), tracked
 
-    def with_surface(self, views: Sequence[View], config: BakeConfig, surface: SurfaceMap | None = None) -> Map:
-        """Return the map with a new surface: ``surface``, or a newly baked one if that is None.
+    def with_surface(
+        self,
+        views: Sequence[View],
+        config: BakeConfig,
+        scan: tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]] | None = None,
+    ) -> Map:
+        """Return the map with a new surface, baked from the points of a ``scan`` (metres, world) and their colours, if given.
 
-        Baking uses the measured depth of the views, or else depth rendered by the field from the map's cameras or,
+        Otherwise, baking uses the measured depth of the views, or else depth rendered by the field from the map's cameras or,
         if it has none, from those of the views. Raises ``InputError`` if there are no cameras at all, and if the
         images do not agree on a surface.
         """
         check_cancelled("surface")
-        if surface is not None:
-            return self.with_parts(surface)
         started = time.monotonic()
         cameras = cameras_of(self.info) or [(view.frame.intrinsics, view.T_ref_camera) for view in views]
-        if not cameras:
+        if scan is not None:
+            surface, source = surface_of_points(*scan, self.bounds, cameras, config), "its own points"
+        elif not cameras:
             raise self._no_cameras()
-        # A few points do not make a surface.
-        is_dense = any(view.frame.has_dense_depth for view in views)
-        measured = [view for view in views if is_dense and view.frame.has_depth]
-        surface = bake(self.field, self.bounds, [] if measured else cameras, measured, config)
+        else:
+            # A few points do not make a surface.
+            is_dense = any(view.frame.has_dense_depth for view in views)
+            measured = [view for view in views if is_dense and view.frame.has_depth]
+            surface = bake(self.field, self.bounds, [] if measured else cameras, measured, config)
+            source = f"{len(measured)} measured views" if measured else f"{len(cameras)} rendered views"
         log.info(
-            f"{self.name}: surface of {len(surface.surfels)} surfels from"
-            f" {f'{len(measured)} measured' if measured else f'{len(cameras)} rendered'} views,"
-            f" {time.monotonic() - started:.1f} s"
+            f"{self.name}: surface of {len(surface.surfels)} surfels from {source}, {time.monotonic() - started:.1f} s"
         )
         return self.with_parts(surface)
 
@@ -456,11 +462,25 @@ class Map:
 def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool = True) -> Map:
     """Load the map in ``folder`` onto ``device``, with its field built by the map's backend and frozen.
 
-    ``baked`` is whether to load the surface and landmarks. Raises ``InputError`` if the folder does not hold a
-    map, or the map is damaged.
+    ``baked`` is whether to load the surface and landmarks. The parts match each other even while a training run is
+    replacing the map. Raises ``InputError`` if the folder does not hold a map, or the map is damaged.
     """
     folder = Path(folder)
-    info, weights, surface, landmarks = read_parts(folder, baked)
+    info = load_info(folder)
+    # A training run may replace the map between the reading of its description and of its parts. Checkpoints are seconds
+    # apart, so each further failure requires a disk slower than that.
+    for _ in range(5):
+        try:
+            weights = read_part(folder, info, "weights") or {}
+            surface, landmarks = (read_part(folder, info, part) if baked else None for part in ("surface", "landmarks"))
+            break
+        except InputError as error:
+            before, info = info, load_info(folder)
+            if replace(before, bidnerf="") == replace(info, bidnerf=""):
+                raise
+            latest = error
+    else:
+        raise InputError("is being replaced faster than it can be read; try again later", where=folder) from latest
     if info.interruption is not None:
         log.info(f"{folder}: {info.interruption}")
     return Map(info, build_frozen_field(info, weights, folder), surface, landmarks, folder).to(device)

@@ -166,30 +166,6 @@ def write_parts(
     return info
 
 
-def read_parts(
-    folder: Path, baked: bool = True
-) -> tuple[MapInfo, dict[str, Tensor], SurfaceMap | None, LandmarkMap | None]:
-    """Read the description and weights of a map and, if ``baked``, its surface and landmarks.
-
-    The parts match each other even while a training run is replacing the map. Raises ``InputError`` if a part
-    is damaged.
-    """
-    info = load_info(folder)
-    # A training run may replace the map between the reading of its description and of its parts. Checkpoints are seconds
-    # apart, so each further failure requires a disk slower than that.
-    for _ in range(5):
-        try:
-            weights = read_part(folder, info, "weights") or {}
-            surface, landmarks = (read_part(folder, info, part) if baked else None for part in ("surface", "landmarks"))
-            return info, weights, surface, landmarks
-        except InputError as error:
-            before, info = info, load_info(folder)
-            if replace(before, bidnerf="") == replace(info, bidnerf=""):
-                raise
-            latest = error
-    raise InputError("is being replaced faster than it can be read; try again later", where=folder) from latest
-
-
 class Checkpoints:
     """The ``Report`` of a training run, which saves checkpoints.
 
@@ -388,10 +364,6 @@ def content_digest(field: RadianceField, surface: SurfaceMap | None, landmarks: 
 def map_folder(out: Path, overwrite: bool) -> contextlib.AbstractContextManager[None]:
     """Prepare a folder for a map and hold its lock within the context, see ``output_folder``."""
 
-    def is_leftover(file: Path) -> bool:
-        """Return whether the file was left behind by a process killed before the map was complete."""
-        return OURS.fullmatch(file.name) is not None and not (file.parent / DESCRIPTION).exists()
-
     def describe(folder: Path) -> str | None:
         try:
             stopped = load_info(folder).interruption
@@ -399,18 +371,23 @@ def map_folder(out: Path, overwrite: bool) -> contextlib.AbstractContextManager[
             return None
         return None if stopped is None else f"holds a map, and {stopped}"
 
-    return output_folder(out, overwrite, is_leftover, describe)
+    return output_folder(
+        out,
+        overwrite,
+        # A process that was killed before the map was complete leaves files without a description.
+        lambda file: OURS.fullmatch(file.name) is not None and not (out / DESCRIPTION).exists(),
+        describe,
+    )
 
 
 def _sweep(folder: Path) -> None:
     """Remove files of earlier and interrupted saves that ``map.json`` does not name; none if ``map.json`` is damaged."""
-    listed = set[str]()
-    if os.path.lexists(folder / DESCRIPTION):
-        try:
-            found = read_json(folder / DESCRIPTION, "the description of a map")
-            listed = {name for part in PART_NAMES if isinstance(name := found.get(part), str)}
-        except (InputError, AttributeError):
-            return
+    path = folder / DESCRIPTION
+    try:
+        found = read_json(path, "the description of a map") if os.path.lexists(path) else {}
+        listed = {name for part in PART_NAMES if isinstance(name := found.get(part), str)}
+    except (InputError, AttributeError):
+        return
     for file in list(folder.iterdir()):
         if OURS.fullmatch(file.name) and file.name not in listed:
             with contextlib.suppress(OSError):  # a left-over file does no harm

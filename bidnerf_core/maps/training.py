@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, cast
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from bidnerf_core.backend import load_backend, quick_config
@@ -50,7 +51,7 @@ from bidnerf_core.maps.store import (
     read_part,
     write_parts,
 )
-from bidnerf_core.maps.views import ReadViews, ViewSource, choose_origin, read_views, views_again
+from bidnerf_core.maps.views import ViewSource, choose_origin, read_views, views_again
 from bidnerf_core.progress import Cancel, ProgressCallback, counter, duration_text, job_context, log
 from bidnerf_core.registry import USUAL_BACKEND, USUAL_POSER, PluginError
 from bidnerf_core.settings import NotNegative, Settings
@@ -291,7 +292,25 @@ def resume(
         info = check_resumable(out, baking is not None)  # another process may have finished meanwhile
         images = replace(images, largest=longest_side(info))
         read, views = views_again(info, posed, images, options.depth_points, options.point_choice, out)
-        _check_same_views(out, info, read, images.split)
+        if stored_cameras(read.views) != given_cameras(info.cameras):
+            raise InputError(
+                f"{f'split {images.split!r} has' if read.source else 'these have'} frames or poses that differ from those"
+                f" {out} was started with",
+                where=read.where,
+                expected=f"those of {info.data!r} unchanged",
+            )
+        background = info.bounds.background
+        for before, now, what in (
+            (background, read.background if read.source else background, "background {}, got {}"),
+            (info.hidden, read.hidden, "{} pixels hidden by masks, got {}; resuming keeps the masks (`masks`)"),
+            (
+                info.sparse_depth,
+                read.sparse_depth,
+                "the depth of {} pixels from points, got {}; resuming keeps the points (`depth_points`) and their selection",
+            ),
+        ):
+            if before != now:
+                raise OtherSettings(f"was started with {what.format(before, now)}", where=out)
         # These are the keypoints and views with which training began.
         optimizer = dict[str, Tensor]()
         with contextlib.suppress(*([InputError] if finish else [])):  # a map that is finished needs no such state
@@ -368,29 +387,6 @@ def poses_folder(out: Path) -> Path:
     return folder.with_name(f"{folder.name}-poses")
 
 
-def _check_same_views(out: Path, info: MapInfo, read: ReadViews, split: str) -> None:
-    """Raise ``InputError`` if the views, their masks, sparse depth or background are not those with which training began."""
-    if stored_cameras(read.views) != given_cameras(info.cameras):
-        raise InputError(
-            f"{f'split {split!r} has' if read.source else 'these have'} frames or poses that differ from those {out} was"
-            " started with",
-            where=read.where,
-            expected=f"those of {info.data!r} unchanged",
-        )
-    background, outcome = info.bounds.background, "resuming keeps"
-    for before, now, what in (
-        (background, read.background if read.source else background, "background {}, got {}"),
-        (info.hidden, read.hidden, f"{{}} pixels hidden by masks, got {{}}; {outcome} the masks (`masks`)"),
-        (
-            info.sparse_depth,
-            read.sparse_depth,
-            f"the depth of {{}} pixels from points, got {{}}; {outcome} the points (`depth_points`) and their selection",
-        ),
-    ):
-        if before != now:
-            raise OtherSettings(f"was started with {what.format(before, now)}", where=out)
-
-
 def _complete(
     scene: Map,
     views: Sequence[View],
@@ -412,7 +408,7 @@ def _complete(
         scene = train_field(views, scene, options, state, beside=_stored_tracks(tracked))
     if baking is not None and scene.has_field:
         if scene.surface is None:
-            scene = bake_if_possible(scene, lambda whole: whole.with_surface(views, baking))
+            scene = bake_if_possible(scene, views, baking)
         scene = scene.with_survey(views, tracked)
     if scene.folder is not None:
         log.info(
@@ -461,10 +457,15 @@ def train_field(
     return Map(report.info, frozen, None, scene.landmarks, out, scene.record).to(device)
 
 
-def bake_if_possible(scene: Map, bake: Callable[[Map], Map]) -> Map:
-    """Return the result of ``bake`` or, if the images do not allow baking, the map without a new surface."""
+def bake_if_possible(
+    scene: Map,
+    views: Sequence[View],
+    config: BakeConfig,
+    scan: tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]] | None = None,
+) -> Map:
+    """Return the map with a new surface, see ``Map.with_surface``; if none can be baked, the map without a new surface."""
     try:
-        return bake(scene)
+        return scene.with_surface(views, config, scan)
     except PluginError:  # nothing that other images would fix
         raise
     except InputError as error:
