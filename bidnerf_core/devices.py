@@ -170,7 +170,9 @@ def run_on(device: torch.device, function: Callable[..., Value], *values: Any) -
             free.remove(lane)
     try:
         if key not in lane.remotes:
-            for old in list(filter(_is_orphaned, lane.remotes)):
+            # Keys that refer to a field or a surface that no longer exists
+            parts = {old: tree_leaves(old) for old in lane.remotes}
+            for old in [old for old in parts if any(isinstance(p, weakref.ref) and p() is None for p in parts[old])]:
                 del lane.remotes[old]
             lane.remotes[key] = _Remote(function, values, tensors, lane)
         lane.remotes.move_to_end(key)
@@ -263,11 +265,6 @@ def _outline(value: Any) -> Any:
     return _map_parts(
         value, lambda part: torch.empty(0) if isinstance(part, Tensor) else weakref.ref(part), (nn.Module, Resident)
     )
-
-
-def _is_orphaned(key: Hashable) -> bool:
-    """Return whether a key of ``_structure`` refers to a field or a surface that no longer exists."""
-    return any(isinstance(part, weakref.ref) and part() is None for part in tree_leaves(key))
 
 
 def _rebuild(value: Any, tensors: Iterator[Tensor]) -> Any:

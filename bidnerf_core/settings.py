@@ -92,8 +92,10 @@ class WholeNumbers(Range):
 
 def _limits(allowed: Range) -> list[str]:
     """Format both limits; an infinite one is empty. The text is the same for 1 and 1.0: ``Annotated`` takes such ranges for equal."""
-    limits = (float(allowed.least), float(allowed.most))
-    return ["" if math.isinf(x) else f"{int(x) if x.is_integer() else x:,}" for x in limits]
+    return [
+        "" if math.isinf(x) else f"{int(x) if x.is_integer() else x:,}"
+        for x in (float(allowed.least), float(allowed.most))
+    ]
 
 
 # Compared and hashed by identity, since the command-line parser hashes annotations and a table is not hashable.

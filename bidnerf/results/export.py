@@ -105,8 +105,7 @@ def export_clouds(scene: Map, out: Path) -> list[Path]:
         vertices = torch.cat(corners).to(torch.float64 if any(scene.origin) else torch.float32)
         files.append(out / "cameras.ply")
         write_file(files[-1], ply({"x y z": vertices}, head(scene, images, what), faces))
-        cameras = [camera.translated(origin_of(scene)) for camera in scene.info.cameras]
-        files += write_inria_cameras(out, cameras)
+        files += write_inria_cameras(out, scene.info.cameras, origin_of(scene))
     return files
 
 

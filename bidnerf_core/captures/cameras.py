@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -49,21 +49,18 @@ class StoredCamera:
         """T_world_camera, float64."""
         return _pose(self.T_world_camera)
 
-    def translated(self, offset: Float[Tensor, "3"]) -> StoredCamera:
-        """Return the camera with ``offset`` (metres, world) added to its position."""
-        return self._map_poses(lambda rows: _rows(_pose(rows).translated(offset)))
-
     def scaled(self, factor: float) -> StoredCamera:
         """Return the camera with all lengths (positions and motion) multiplied by ``factor``."""
-        scaled = self._map_poses(lambda rows: (*((a, b, c, t * factor) for a, b, c, t in rows[:3]), rows[3]))
-        return replace(scaled, motion=self.motion and (*scale_point(self.motion[:3], factor), *self.motion[3:]))
 
-    def _map_poses(self, change: Callable[[MatrixRows], MatrixRows]) -> StoredCamera:
+        def scale(rows: MatrixRows) -> MatrixRows:
+            return (*((a, b, c, t * factor) for a, b, c, t in rows[:3]), rows[3])
+
         given = self.given_T_world_camera
         return replace(
             self,
-            T_world_camera=change(self.T_world_camera),
-            given_T_world_camera=None if given is None else change(given),
+            T_world_camera=scale(self.T_world_camera),
+            given_T_world_camera=None if given is None else scale(given),
+            motion=self.motion and (*scale_point(self.motion[:3], factor), *self.motion[3:]),
         )
 
 
@@ -218,10 +215,12 @@ def _pose(rows: MatrixRows | Sequence[MatrixRows]) -> SE3:
     return SE3.from_matrix(torch.tensor(rows, dtype=torch.float64))
 
 
-def write_inria_cameras(folder: Path, cameras: Sequence[StoredCamera]) -> list[Path]:
+def write_inria_cameras(
+    folder: Path, cameras: Sequence[StoredCamera], origin: Float[Tensor, "3"] | None = None
+) -> list[Path]:
     """Write ``cameras.json`` to ``folder`` and return its path in a list; write nothing if there are no cameras.
 
-    The format stores no principal points; readers take the image centres instead.
+    Positions are written relative to the world, in which those of the cameras are relative to ``origin`` (by default 0). The format stores no principal points; readers take the image centres instead.
     """
     if not cameras:
         return []
@@ -231,7 +230,7 @@ def write_inria_cameras(folder: Path, cameras: Sequence[StoredCamera]) -> list[P
             "img_name": camera.name,
             "width": camera.intrinsics.width,
             "height": camera.intrinsics.height,
-            "position": camera.pose.translation.tolist(),
+            "position": (camera.pose.translation if origin is None else camera.pose.translation + origin).tolist(),
             "rotation": camera.pose.rotation.tolist(),
             "fx": camera.intrinsics.fx,
             "fy": camera.intrinsics.fy,

@@ -134,15 +134,13 @@ def track_landmarks(
     Returns the tracks (None if none are needed), from which baking builds the map's landmarks, and the views with
     the landmarks visible in each, which provide distances for training.
     """
-    if not any(map(_lacks_distances, views)):
-        return None, list(views)
-    tracked = _track(views, features, trust_poses, depth_unit, labels)
+    tracked = _track(views, features, trust_poses, depth_unit, labels) if _lack_distances(views) else None
     return tracked, _with_landmarks(views, tracked)
 
 
-def _lacks_distances(view: View) -> bool:
+def _lack_distances(views: Sequence[View]) -> bool:
     """Return whether a view has neither dense depth nor a silhouette, so that training has no cue to where the surfaces are."""
-    return not (view.frame.has_dense_depth or has_outline(view))
+    return not all(view.frame.has_dense_depth or has_outline(view) for view in views)
 
 
 def _track(
@@ -196,9 +194,9 @@ def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> 
     )
 
 
-def _with_landmarks(views: Sequence[View], tracked: TrackedViews) -> list[View]:
+def _with_landmarks(views: Sequence[View], tracked: TrackedViews | None) -> list[View]:
     """Return the views with the landmarks visible in each, or unchanged if no view needs landmarks for distances."""
-    if not any(map(_lacks_distances, views)):
+    if tracked is None or not _lack_distances(views):
         return list(views)
     seen = tracked.landmarks_by_image(DEFAULT_LANDMARKS)
     log.info(f"{sum(len(part.distance) for part in seen)} sightings of landmarks in {len(views)} views")

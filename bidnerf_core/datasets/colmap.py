@@ -120,9 +120,8 @@ class SparsePoints:
         image = self._image(name, split)
         if image is None:
             return torch.zeros((0, 3), dtype=torch.float64)
-        position = torch.searchsorted(self._points.ids, image.points).clamp(max=len(self._points.ids) - 1)
-        position = position[(self._points.ids[position] == image.points) & self._chosen[position]]
-        points = image.T_camera_model.apply(self._points.positions[position]) * self.metres
+        rows = self._points.rows(image.points, self._chosen)
+        points = image.T_camera_model.apply(self._points.positions[rows[rows >= 0]]) * self.metres
         return points[points[:, 2] > 0]
 
     def onto(self, view: View, split: str) -> View:

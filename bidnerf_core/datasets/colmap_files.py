@@ -24,7 +24,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -64,6 +64,13 @@ class ModelPoints:
     positions: Float[Tensor, "p 3"]  # model frame, in units of the model
     errors: Float[Tensor, "p"]  # mean reprojection error, pixels; negative where it was never computed
     tracks: Int[Tensor, "p"]  # number of observations
+
+    def rows(self, ids: Int[Tensor, "n"], chosen: Bool[Tensor, "p"]) -> Int[Tensor, "n"]:
+        """Return the indices of the points with these ids; -1 for ids that are unknown or of points that are not ``chosen``."""
+        if not len(self.ids):
+            return torch.full_like(ids, -1)
+        index = torch.searchsorted(self.ids, ids).clamp(max=len(self.ids) - 1)
+        return torch.where((self.ids[index] == ids) & chosen[index], index, -1)
 
 
 def read_model(folder: Path) -> tuple[list[ModelImage], ModelPoints]:

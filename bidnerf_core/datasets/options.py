@@ -66,14 +66,13 @@ class DatasetOptions:
             raise UsageError(
                 f"`mask_hides` {self.mask_hides} was given without `masks`", expected="the folder of masks"
             )
-        if self.depth_unit is None:
-            return
-        from bidnerf_core.depth import FARTHEST
+        if self.depth_unit is not None:
+            from bidnerf_core.depth import FARTHEST
 
-        if not 0 < self.depth_unit <= FARTHEST:
-            raise InputError(
-                f"depth_unit is {self.depth_unit:g}", expected="a positive number of metres per step, such as 0.001"
-            )
+            if not 0 < self.depth_unit <= FARTHEST:
+                raise InputError(
+                    f"depth_unit is {self.depth_unit:g}", expected="a positive number of metres per step, such as 0.001"
+                )
 
     def open(self, path: str | Path, readers: Sequence[Reader] | None = None) -> Capture:
         """Open the dataset in the folder ``path``.

@@ -19,7 +19,7 @@ from bidnerf_core.datasets.reader import find_reader
 from bidnerf_core.datasets.video import is_video
 from bidnerf_core.errors import InputError, InputWarning, amount, enumeration
 from bidnerf_core.frames import natural_order, photos_in
-from bidnerf_core.io import open_binary, read_header
+from bidnerf_core.io import find_header, open_binary
 from bidnerf_core.registry import Plugins, interface_defects
 
 POSE_NAMES = re.compile(
@@ -137,7 +137,9 @@ def _without_copies(folder: Path, photos: Sequence[Path]) -> list[Path]:
             names = dict.fromkeys(str((c.parent if c.parent != folder else c).relative_to(folder)) for c in copies)
             warn_about(folder, f"{enumeration(list(names), 4)}: {what}, left out ({amount(len(copies), 'image')})")
 
-    leave_out([photo for photo in left if _is_deep_grey(photo)], "grey images of 16 bits or more, such as depth")
+    others = [photo for photo in left if photo.suffix.lower() not in (".jpg", ".jpeg")]
+    deep = [photo for photo in others if (header := find_header(photo)) is not None and header.deep_grey]
+    leave_out(deep, "grey images of 16 bits or more, such as depth")
     matches = [(photo, DERIVED.fullmatch(photo.stem)) for photo in left]
     leave_out(
         [photo for photo, match in matches if match and photo.with_name(match[1]) in whole], "computed from photos"
@@ -150,9 +152,8 @@ def _without_copies(folder: Path, photos: Sequence[Path]) -> list[Path]:
     for photo in left:
         groups[photo.parent].append(photo)
     for below, group in groups.items():
-        with contextlib.suppress(InputError):  # raised again when that photo is read
-            size = read_header(group[0]).size
-            alike[below.parent, frozenset(photo.stem for photo in group)].append((*size, below))
+        if (header := find_header(group[0])) is not None:
+            alike[below.parent, frozenset(photo.stem for photo in group)].append((*header.size, below))
     smaller = {
         below
         for largest, sized in ((max(sized), sized) for sized in alike.values())
@@ -161,12 +162,6 @@ def _without_copies(folder: Path, photos: Sequence[Path]) -> list[Path]:
     }
     leave_out([photo for photo in left if photo.parent in smaller], "smaller copies of the photos beside them")
     return left
-
-
-def _is_deep_grey(photo: Path) -> bool:
-    with contextlib.suppress(InputError):  # raised again when that photo is read
-        return photo.suffix.lower() not in (".jpg", ".jpeg") and read_header(photo).deep_grey
-    return False
 
 
 def _subfolders(folder: Path, out: Path | None) -> Iterator[Path]:

@@ -14,7 +14,7 @@ from bidnerf_core.camera import CentralLens, Intrinsics
 from bidnerf_core.datasets.capture import SPLITS
 from bidnerf_core.datasets.formats.transforms_json import METRES_PER_DEPTH_UNIT, SPLIT_FILES
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import png_bytes, write_file
 
@@ -49,7 +49,12 @@ def _write_view(folder: Path, split: str, view: View, background: tuple[float, f
     """Write the images of a frame and return the frame's entry."""
     frame = view.frame
     entry = frame_entry(f"images/{split}/{frame.name}.png", frame.name, frame.intrinsics, view.T_ref_camera)
-    _write(folder / entry["file_path"], _colours(frame, background))
+    colours = frame.rgb.detach().cpu()
+    if frame.alpha is not None:
+        cover = frame.alpha.detach().cpu()[..., None]
+        straight = (colours - (1 - cover) * colours.new_tensor(background)) / cover.clamp(min=1e-3)
+        colours = torch.cat([straight, cover], dim=-1)  # RGBA that is not premultiplied
+    _write(folder / entry["file_path"], (colours.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
     if frame.depth is not None:
         largest = 65534  # readers interpret the largest 16-bit number as "not measured"
         unit = max(METRES_PER_DEPTH_UNIT, float(frame.depth.max()) / largest)
@@ -92,16 +97,6 @@ def frame_entry(
         "h": camera.height,
         **dict(zip(lens, values, strict=False)),
     }
-
-
-def _colours(frame: Frame, background: tuple[float, float, float]) -> np.ndarray:
-    """Return RGB, or straight (not premultiplied) RGBA if the frame has alpha."""
-    colours = frame.rgb.detach().cpu()
-    if frame.alpha is not None:
-        cover = frame.alpha.detach().cpu()[..., None]
-        straight = (colours - (1 - cover) * colours.new_tensor(background)) / cover.clamp(min=1e-3)
-        colours = torch.cat([straight, cover], dim=-1)
-    return (colours.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 
 
 def _write(path: Path, pixels: np.ndarray) -> None:

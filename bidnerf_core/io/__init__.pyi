@@ -25,6 +25,7 @@ from .images import ImageSource as ImageSource
 from .images import background_colour as background_colour
 from .images import composite as composite
 from .images import decode as decode
+from .images import find_header as find_header
 from .images import is_heif as is_heif
 from .images import looks_like_image as looks_like_image
 from .images import open_image as open_image

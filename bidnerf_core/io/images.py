@@ -73,6 +73,13 @@ def read_header(path: ImageSource) -> ImageHeader:
         return ImageHeader(image.width, image.height, has_alpha, image.mode[:1] in "IF")
 
 
+def find_header(path: ImageSource) -> ImageHeader | None:
+    """Return what ``read_header`` does, or None if the image is unreadable, which is an error only when its pixels are read."""
+    with contextlib.suppress(InputError):
+        return read_header(path)
+    return None
+
+
 def read_image(
     path: ImageSource, background: Sequence[float] = (0.0, 0.0, 0.0), size: tuple[int, int] | None = None
 ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:

@@ -190,8 +190,7 @@ def _old_views(scene: Map, data: ViewSource | None, split: str) -> list[View]:
     """Return the images in ``data`` at the map's poses or, without ``data``, renderings from the map's cameras."""
     if data is not None:
         _, views = views_again(scene.info, data, DatasetOptions(split=split))
-        own = {camera.name for camera in scene.info.cameras}
-        if not any(view.frame.name in own for view in views):
+        if not {camera.name for camera in scene.info.cameras} & {view.frame.name for view in views}:
             raise InputError(
                 "data has none of the images that the map was built from", where=scene.name, expected="these"
             )

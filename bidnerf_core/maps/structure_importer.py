@@ -11,9 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
-import torch
-from torch import Tensor
-
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import (
     Capture,
@@ -25,7 +22,7 @@ from bidnerf_core.datasets import (
     unique_names,
 )
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.geometry import SE3, Similarity
+from bidnerf_core.geometry import Similarity
 from bidnerf_core.mapping import Keypoints
 from bidnerf_core.maps.importers import ImportedField, Structure, bounds_about
 from bidnerf_core.settings import Settings
@@ -57,7 +54,7 @@ class StructureImporter:
         found = [f"{model}: {amount(len(images), 'image')}, {amount(len(points.ids), 'point')}"]
         shots = [shot_of(model, image, files.get(image.name), cameras) for image in images]
         sound, positions = points.positions.isfinite().all(-1), placement.apply(points.positions)
-        observed = [_numbers(image.observed, points.ids, sound) for image in images]
+        observed = [points.rows(image.observed, sound) for image in images]
         known: Mapping[str, Keypoints] = {}
         given = None if config.keypoints in ("", "photos") else Path(config.keypoints)
         beside = (folder / "database.db" for folder in (model, model.parent, model.parent.parent))
@@ -87,16 +84,16 @@ class StructureImporter:
                 f"none of its {amount(len(images), 'image')} can be used, such as {left_out[0]}", where=model
             )
         found += [f"left out: {line}" for line in left_out]
-        poses = [image.T_camera_model.inverse() for image in images]
-        scaled = [SE3(T.rotation, placement.scale * T.translation) for T in poses]
-        posed = [
-            replace(
-                shots[number], name=name, T_world_camera=placement.T_target_source @ scaled[number], splits=("train",)
-            )
-            for number, name in zip(usable, unique_names([shots[number].parts for number in usable]), strict=True)
-        ]
+        poses = [placement.move(images[number].T_camera_model.inverse()) for number in usable]
+        names = unique_names([shots[number].parts for number in usable])
         structure = Structure(
-            Capture(path, posed),
+            Capture(
+                path,
+                [
+                    replace(shots[number], name=name, T_world_camera=T, splits=("train",))
+                    for number, name, T in zip(usable, names, poses, strict=True)
+                ],
+            ),
             positions,
             tuple(observed[number] for number in usable),
             tuple(known[images[number].name] for number in usable) if known else (),
@@ -104,14 +101,6 @@ class StructureImporter:
         return ImportedField(
             "", None, {}, bounds_about(positions[sound]), found=tuple(found), steps=0, structure=structure
         )
-
-
-def _numbers(observed: Tensor, ids: Tensor, sound: Tensor) -> Tensor:
-    """Convert the ids of observed points to their indices in ``ids``; -1 for points that are unknown or not finite."""
-    if not len(ids):
-        return torch.full_like(observed, -1)
-    index = torch.searchsorted(ids, observed).clamp(max=len(ids) - 1)
-    return torch.where((ids[index] == observed) & sound[index], index, -1)
 
 
 def _misfit(

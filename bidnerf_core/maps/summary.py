@@ -82,8 +82,7 @@ class MapSummary:
 
     def plain(self) -> dict[str, Any]:
         """Return the facts as JSON-serializable values."""
-        described = {name: getattr(self.info, name) for name in DESCRIBED}
-        return cast(dict[str, Any], to_plain(described | self.facts))
+        return cast(dict[str, Any], to_plain({name: getattr(self.info, name) for name in DESCRIBED} | self.facts))
 
     def __str__(self) -> str:
         info, facts, bounds = self.info, self.facts, self.info.bounds

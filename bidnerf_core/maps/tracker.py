@@ -6,7 +6,7 @@ import math
 import time as clocks
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 
@@ -84,6 +84,7 @@ class Tracker:
         features = None if matcher is None else limit_features(matcher.features, 600)
         self._measure = Measurer(self._scene, self._landmarks, features, localizer.depth_sensor, localizer.config)
         self._extent = extent_of(self._scene)
+        self._key = str(getattr(getattr(self._scene, "info", None), "weights", ""))
 
     @property
     def tracking(self) -> bool:
@@ -251,8 +252,3 @@ class Tracker:
         if depth is None or not shows_shape(frame):
             return 0.3 * self._extent
         return float(depth[depth > 0].median())
-
-    @property
-    def _key(self) -> str:
-        info: Any = getattr(self._scene, "info", None)
-        return "" if info is None else str(info.weights)

@@ -48,8 +48,12 @@ STATE_KINDS = {
 def save_state(path: Path, state: TrackerState, key: str) -> None:
     """Write a state as safetensors, atomically; ``key`` identifies the map."""
     tensors: dict[str, Tensor] = {}
-    numbers = to_plain(state, tensors=tensors)
-    content = {"format": STATE_FORMAT, "version": STATE_VERSION, "map": key, "state": numbers}
+    content = {
+        "format": STATE_FORMAT,
+        "version": STATE_VERSION,
+        "map": key,
+        "state": to_plain(state, tensors=tensors),
+    }
     write_file(path, tensors_to_bytes(pack_tensors(tensors), {"bidnerf": json.dumps(content, allow_nan=False)}))
 
 
@@ -61,8 +65,9 @@ def load_tracker_state(path: Path, key: str) -> TrackerState:
     if not isinstance(found, dict) or found.get("format") != STATE_FORMAT:
         raise InputError("not the state of a tracker", where=path, expected=expected)
     if found.get("version") != STATE_VERSION:
-        hint = f"{STATE_VERSION}; begin the sequence anew"
-        raise InputError(f"version {found.get('version')!r}", where=path, expected=hint)
+        raise InputError(
+            f"version {found.get('version')!r}", where=path, expected=f"{STATE_VERSION}; begin the sequence anew"
+        )
     if found.get("map") != key:
         raise InputError(f"belongs to map {found.get('map')!r}, the tracker's is {key!r}", where=path)
     state = from_plain(TrackerState, with_tensors(found.get("state"), tensors, str(path)), str(path))

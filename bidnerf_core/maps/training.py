@@ -165,8 +165,25 @@ def train(
         open_posed_images(data, options.images, folder, options.overwrite, options.poser) as (posed, images),
     ):
         if known is not None and folder is not None:
-            scene, views, tracked = _with_field(load_map(folder), posed, images, options)
-            info = replace(scene.info, backend=backend, config=to_plain(settings, "config"))
+            scene, images = load_map(folder), replace(images, largest=longest_side(known))
+            read, views = views_again(known, posed, images, options.depth_points, options.point_choice, folder)
+            own = {camera.name for camera in known.cameras}
+            if unknown := [view.frame.name for view in read.views if view.frame.name not in own]:
+                raise InputError(
+                    f"image {unknown[0]!r} is none of those of {scene.name}",
+                    where=read.where,
+                    expected="images of that map",
+                )
+            tracked, views = track_landmarks(views, known.landmark_features, True, read.depth_unit)
+            info = replace(
+                scene.info,
+                backend=backend,
+                config=to_plain(settings, "config"),
+                bounds=estimate_bounds(views, read.background),
+                complete=False,
+                hidden=read.hidden,
+                sparse_depth=read.sparse_depth,
+            )
             return _complete(replace(scene, info=info), views, tracked, options, baking)
         read = read_views(posed, images, options.depth_points, options.point_choice, folder)
         origin = choose_origin(torch.stack([view.T_ref_camera.translation.cpu() for view in read.views]))
@@ -227,23 +244,6 @@ def settings_from(config: Any, kind: type, what: str) -> Any:
             f"config is a {type(config).__name__}", expected=f"a {kind.__name__} or a dict of its settings"
         )
     return config
-
-
-def _with_field(
-    scene: Map, data: ViewSource, images: DatasetOptions, options: TrainOptions
-) -> tuple[Map, list[View], TrackedViews | None]:
-    """Prepare a landmark-only map for training a field. Return the map, its images at the stored poses, and their keypoints."""
-    info, images = scene.info, replace(images, largest=longest_side(scene.info))
-    read, views = views_again(info, data, images, options.depth_points, options.point_choice, scene.folder)
-    own = {camera.name for camera in info.cameras}
-    if unknown := [view.frame.name for view in read.views if view.frame.name not in own]:
-        raise InputError(
-            f"image {unknown[0]!r} is none of those of {scene.name}", where=read.where, expected="images of that map"
-        )
-    tracked, views = track_landmarks(views, info.landmark_features, True, read.depth_unit)
-    bounds = estimate_bounds(views, read.background)
-    info = replace(info, bounds=bounds, complete=False, hidden=read.hidden, sparse_depth=read.sparse_depth)
-    return replace(scene, info=info), views, tracked
 
 
 @contextlib.contextmanager

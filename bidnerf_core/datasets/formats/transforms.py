@@ -37,10 +37,9 @@ from bidnerf_core.datasets.file_names import FileNames
 from bidnerf_core.datasets.formats.transforms_json import SPLIT_FILES, FrameRecord, read_splits
 from bidnerf_core.datasets.reader import DatasetOptions, Format, first_file
 from bidnerf_core.depth import DepthReader
-from bidnerf_core.errors import InputError
 from bidnerf_core.frames import MaskFile
 from bidnerf_core.geometry import LengthUnit
-from bidnerf_core.io import background_colour, is_file, read_header
+from bidnerf_core.io import background_colour, find_header, is_file
 
 
 def _read(path: Path, folder: Path, options: DatasetOptions) -> Capture:
@@ -63,7 +62,10 @@ def _read(path: Path, folder: Path, options: DatasetOptions) -> Capture:
     read_depth, size = DepthReader(), _first_size([frame for frame, _ in listed], images)
     shots, first = list[Shot](), dict[tuple[str, ...], Path]()
     for (frame, splits), image in zip(listed, images, strict=True):
-        camera = _camera(frame, size)
+        camera: Camera | CameraSource = CameraSource()  # if no image is readable, which is an error when one is read
+        if size is not None or None not in (frame.record.size("w"), frame.record.size("h")):
+            # Without a size in the file, the first image's size is used, since all images share the lens.
+            camera = camera_of_record(frame.record, size or (0, 0))
         if isinstance(camera, PanoramaFace) and frame.depth_path is not None:
             raise frame.record.error(
                 "an equirectangular image has depth", expected="none, or pinhole images with depth"
@@ -88,7 +90,8 @@ def _read(path: Path, folder: Path, options: DatasetOptions) -> Capture:
         )
         if is_file(image):
             first.setdefault(splits[:1], image)
-    white = options.background is None and any(has_alpha for _, has_alpha in map(_header, first.values()))
+    headers = map(find_header, first.values()) if options.background is None else ()
+    white = any(header is not None and header.has_alpha for header in headers)
     return Capture(
         path,
         shots,
@@ -104,19 +107,16 @@ def _find(path: Path) -> Path | None:
     return next((f for f in folders if first_file(f, "transforms.json", *SPLIT_FILES.values())), None)
 
 
-def _camera(frame: FrameRecord, size: tuple[int, int] | None) -> Camera | CameraSource:
-    """Return the camera of a frame; without a size in the file, the first image's size is used, since all images share the lens."""
-    if size is None and None in (frame.record.size("w"), frame.record.size("h")):
-        return CameraSource()  # no image is readable, which is an error when one is read
-    return camera_of_record(frame.record, size or (0, 0))
-
-
 def _first_size(frames: Sequence[FrameRecord], images: Sequence[Path]) -> tuple[int, int] | None:
     """Return the size of the first readable image. If its camera has another size, a remark states that cameras are scaled."""
-    sized = ((frame, image, _header(image)[0]) for frame, image in zip(frames, images, strict=True))
-    frame, image, size = next((each for each in sized if each[2] is not None), (None, None, None))
-    if frame is None or image is None or size is None:
+    sized = (
+        (frame, image, header.size)
+        for frame, image in zip(frames, images, strict=True)
+        if (header := find_header(image)) is not None
+    )
+    if (found := next(sized, None)) is None:
         return None
+    frame, image, size = found
     given = frame.record.size("w") or size[0], frame.record.size("h") or size[1]
     if given != size and same_aspect(given, size):
         warn_about(
@@ -125,15 +125,6 @@ def _first_size(frames: Sequence[FrameRecord], images: Sequence[Path]) -> tuple[
             " images",
         )
     return size
-
-
-def _header(image: Path) -> tuple[tuple[int, int] | None, bool]:
-    """Return an image's size, or None if it is unreadable (an error only when it is read), and whether it has alpha."""
-    try:
-        header = read_header(image)
-    except InputError:
-        return None, False
-    return header.size, header.has_alpha
 
 
 reader = Format(
