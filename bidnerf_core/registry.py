@@ -164,8 +164,7 @@ def list_plugins(group: str) -> list[PluginInfo]:
         for (of, name), value in list(registered.items())
         if of == group
     ]
-    replaced = {info.name for info in own}
-    declared = [info for info in _declared(group) if info.name not in replaced]
+    declared = [info for info in _declared(group) if (group, info.name) not in registered]
     return sorted([*own, *declared], key=lambda info: (info.name, info.distribution, info.value))
 
 

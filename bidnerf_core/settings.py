@@ -174,8 +174,7 @@ def _with_values(default: S, flat: dict[str, Any], where: str) -> S:
         if dataclasses.is_dataclass(value):
             values[field.name] = _with_values(value, flat, where)
         elif field.name in flat:
-            one = cast(Any, dict)[str, hints[field.name]]
-            values |= from_plain(one, {field.name: flat[field.name]}, where)
+            values |= from_plain(cast(Any, dict)[str, hints[field.name]], {field.name: flat[field.name]}, where)
         else:
             values[field.name] = value
     try:

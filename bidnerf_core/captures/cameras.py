@@ -19,7 +19,7 @@ from bidnerf_core.camera import Intrinsics, Orientation
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, Similarity, scale_point
-from bidnerf_core.io import parse_record, read_file, write_file
+from bidnerf_core.io import read_json, write_file
 from bidnerf_core.settings import Range, Settings
 
 MatrixRows = tuple[tuple[float, float, float, float], ...]
@@ -251,8 +251,7 @@ def cameras_beside(path: Path, placement: Similarity) -> tuple[StoredCamera, ...
         return ()
     cameras = list[StoredCamera]()
     try:
-        record = parse_record(str(file), b'{"cameras":' + read_file(file, INRIA_CAMERAS) + b"}")
-        for entry in record.items("cameras") or []:
+        for entry in read_json(file, INRIA_CAMERAS):
             width, height = entry["width"], entry["height"]
             camera = Intrinsics(float(entry["fx"]), float(entry["fy"]), width / 2, height / 2, int(width), int(height))
             rotation, position = (torch.tensor(entry[key], dtype=torch.float64) for key in ("rotation", "position"))

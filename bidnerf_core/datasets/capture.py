@@ -167,8 +167,9 @@ class Shot:
         for face in PANORAMA_FACES:
             camera = replace(self.camera, face=face)
             turn = SE3(torch.from_numpy(camera.rotation).double(), torch.zeros(3, dtype=torch.float64))
-            T = self.T_world_camera @ turn
-            faces.append(replace(self, camera=camera, T_world_camera=T, stem=f"{self.stem}_{face}"))
+            faces.append(
+                replace(self, camera=camera, T_world_camera=self.T_world_camera @ turn, stem=f"{self.stem}_{face}")
+            )
         return faces
 
 

@@ -107,8 +107,7 @@ class Photos:
             if text not in self._remarks:
                 log.info("%s: %s", shot.name, text)
             self._remarks.add(text)
-        views = (View(frame, SE3.identity()),)
-        return Query(frame.name, views, None, shot.file)
+        return Query(frame.name, (View(frame, SE3.identity()),), None, shot.file)
 
 
 class DatasetFrames:

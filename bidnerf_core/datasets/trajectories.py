@@ -170,8 +170,10 @@ class Trajectory:
             return None
         share = (time - start) / (end - start)
         turns = Slerp([0.0, 1.0], Rotation.from_matrix(self.rotations[after - 1 : after + 1].numpy()))
-        rotation = torch.from_numpy(turns(share).as_matrix())
-        return SE3(rotation, torch.lerp(self.translations[after - 1], self.translations[after], share))
+        return SE3(
+            torch.from_numpy(turns(share).as_matrix()),
+            torch.lerp(self.translations[after - 1], self.translations[after], share),
+        )
 
 
 def read_trajectory(path: Path, times: Sequence[float] | None = None) -> Trajectory:
@@ -288,8 +290,10 @@ def read_matrices(path: Path) -> list[SE3]:
     """
     columns = f"{KITTI_ROW} numbers, a 3x4 matrix"
     rows = [(row, _words(row)) for row in read_rows(path, "a file of KITTI poses", columns)]
-    complete = _complete(path, rows, KITTI_ROW, columns)
-    return [pose_of_matrix(row.where, row.numbers(words, KITTI_ROW)) for row, words in complete]
+    return [
+        pose_of_matrix(row.where, row.numbers(words, KITTI_ROW))
+        for row, words in _complete(path, rows, KITTI_ROW, columns)
+    ]
 
 
 def read_pose_matrix(path: Path) -> SE3 | None:

@@ -198,8 +198,7 @@ def to_plain(value: Any, where: str = "", tensors: dict[str, Tensor] | None = No
     if isinstance(value, dict):
         if odd := [key for key in value if not isinstance(key, str)]:
             raise InputError(f"{where or 'value'} has the key {odd[0]!r}", expected="text")
-        inside = f"{where}." if where else ""
-        return {key: to_plain(item, f"{inside}{key}", tensors) for key, item in value.items()}
+        return {key: to_plain(item, f"{where}.{key}" if where else key, tensors) for key, item in value.items()}
     if isinstance(value, tuple | list):
         return [to_plain(item, f"{where}[{index}]", tensors) for index, item in enumerate(value)]
     if _is_tensor(value) and tensors is not None:

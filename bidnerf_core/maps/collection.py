@@ -181,8 +181,14 @@ class MapCollection:
         chosen = max(quick, key=lambda name: _merit(quick[name]))  # the first of equal ones
         found = self.localizer(chosen)(frame, seed=seed)
         second = max([name for name in quick if name != chosen], key=lambda name: _merit(quick[name]), default=None)
-        runner_up = None if second is None else (second, quick[second])
-        return Placement(chosen, found, runner_up, ranking, tuple(quick), self._infos[chosen].backend)
+        return Placement(
+            chosen,
+            found,
+            None if second is None else (second, quick[second]),
+            ranking,
+            tuple(quick),
+            self._infos[chosen].backend,
+        )
 
     def _by_landmarks(self, name: str, frame: Frame, seed: int) -> Localization:
         """Localize a frame with the landmarks of a map.
@@ -193,8 +199,7 @@ class MapCollection:
         try:
             if not localizer.matches_landmarks:
                 return localizer(frame, seed=seed)
-            rays = getattr(localizer.config, "fused_rays", 0)
-            found = localize_by_landmarks(localizer.problem(frame), rays, seed)
+            found = localize_by_landmarks(localizer.problem(frame), getattr(localizer.config, "fused_rays", 0), seed)
         except InputError as error:  # such as a map without a surface
             why, losses = Verdict(Outcome.TOO_FEW_MATCHES, str(error)), torch.zeros(0, dtype=torch.float64)
             return Localization.of(why, SE3.unknown()[None], losses, self.method, time.perf_counter(), math.nan)
@@ -245,5 +250,8 @@ def _maps_by_name(scenes: str | Path | Sequence[Map | str | Path] | Mapping[str,
 
 def _merit(found: Localization) -> tuple[bool, float, float]:
     """Return the key that ranks answers from several maps: acceptance, then inliers, then confidence."""
-    inliers = getattr(found.diagnostics, "inliers", 0)
-    return found.converged, float(inliers), -1.0 if found.confidence is None else found.confidence
+    return (
+        found.converged,
+        float(getattr(found.diagnostics, "inliers", 0)),
+        -1.0 if found.confidence is None else found.confidence,
+    )

@@ -166,8 +166,8 @@ def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], lis
     elif (path := Path(photos)).is_dir() and find_reader(path) is not None:
         source = open_dataset(path, background).split(split)
     else:
-        camera = CameraSource(assumed=landmark_cameras(scene))
-        source = Photos(photo_files([path]), DatasetOptions(camera, background=background)).capture
+        options = DatasetOptions(CameraSource(assumed=landmark_cameras(scene)), background=background)
+        source = Photos(photo_files([path]), options).capture
     if isinstance(source, Capture):
         for index, name in enumerate(source.names):
             try:
@@ -199,7 +199,6 @@ def _old_views(scene: Map, data: ViewSource | None, split: str) -> list[View]:
     for number, camera in enumerate(scene.info.cameras, start=1):
         small, pose = camera.intrinsics.at_most(320), camera.pose
         image = render_image(scene.field, small, pose, scene.bounds)
-        frame = Frame(camera.name, image.rgb.cpu().clamp(0, 1), small)
         # Training preserves some of the distances that the field renders, without treating them as measurements.
         depth, generator = image.depth.cpu(), torch.Generator().manual_seed(number)
         solid = ((image.opacity.cpu() > 0.95) & (depth > 0)).nonzero()
@@ -207,7 +206,7 @@ def _old_views(scene: Map, data: ViewSource | None, split: str) -> list[View]:
         pixels = rows.flip(-1).double() + 0.5
         distance = depth[rows[:, 0], rows[:, 1]].double() * small.unproject(pixels).norm(dim=-1)
         seen = SeenLandmarks(pixels.float(), distance.float(), (0.01 * distance).float())
-        views.append(View(frame, pose, landmarks=seen))
+        views.append(View(Frame(camera.name, image.rgb.cpu().clamp(0, 1), small), pose, landmarks=seen))
         count(number, len(scene.info.cameras))
     return views
 
@@ -293,24 +292,27 @@ def _train_further(scene: Map, views: Sequence[View], steps: int | None, share: 
     if not isinstance(field, nn.Module):
         raise InputError(f"the map's field is a {type(field).__name__}", expected="an nn.Module of a backend")
     if info.field_frame is not None:
-        views = [_in_field_unit(view, 1 / info.field_frame.scale) for view in views]
+        factor = 1 / info.field_frame.scale
+        views = [
+            replace(
+                view,
+                frame=view.frame if view.frame.depth is None else view.frame.replace(depth=view.frame.depth * factor),
+                T_ref_camera=SE3(view.T_ref_camera.rotation, view.T_ref_camera.translation * factor),
+                landmarks=view.landmarks
+                and replace(
+                    view.landmarks,
+                    distance=view.landmarks.distance * factor,
+                    deviation=view.landmarks.deviation * factor,
+                ),
+            )
+            for view in views
+        ]
     restarted = replace(info, step=0, complete=False, config=to_plain(settings, "config"))
     grown = train_field(
         views, Map(restarted, NoField()), TrainOptions(device=device_of(scene.field)), weights=field.state_dict()
     )
     info = replace(info, step=info.step + grown.info.step, seconds=grown.info.seconds)
     return replace(scene, info=info, field=grown.field, folder=None, record=scene.capture)
-
-
-def _in_field_unit(view: View, factor: float) -> View:
-    """Return a view with all lengths multiplied by a factor."""
-    frame, T, seen = view.frame, view.T_ref_camera, view.landmarks
-    return replace(
-        view,
-        frame=frame if frame.depth is None else frame.replace(depth=frame.depth * factor),
-        T_ref_camera=SE3(T.rotation, T.translation * factor),
-        landmarks=seen and replace(seen, distance=seen.distance * factor, deviation=seen.deviation * factor),
-    )
 
 
 def _present(landmarks: LandmarkMap, more: LandmarkMap) -> Bool[Tensor, "n"]:

@@ -44,7 +44,6 @@ from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import lock
 from bidnerf_core.mapping import (
     BakeConfig,
-    HeldOutTrial,
     LandmarkMap,
     SurfaceMap,
     TrackedViews,
@@ -391,8 +390,7 @@ class Map:
         landmarks = self.landmarks
         if landmarks is not None:
             landmarks = replace(landmarks, trial=tried_field(scene, views, landmarks.trial))
-        trial = HeldOutTrial() if landmarks is None else landmarks.trial
-        capture = survey_capture(tracked, views, trial=trial, up=self.up)
+        capture = survey_capture(tracked, views, trial=None if landmarks is None else landmarks.trial, up=self.up)
         for line in summary(capture):
             log.info(line)
         return scene.with_parts(None, landmarks, capture)

@@ -201,8 +201,11 @@ class Tracker:
         """Start tracking at a pose found by a search."""
         reason = f"relocalized after {state.lost} frames: {found.reason}" if state.lost else found.reason
         if found.intrinsics is not None:
-            camera = invert_correction(stated.intrinsics, found.intrinsics)
-            state = replace(state, camera=camera, is_approximate=stated.focal_is_approximate)
+            state = replace(
+                state,
+                camera=invert_correction(stated.intrinsics, found.intrinsics),
+                is_approximate=stated.focal_is_approximate,
+            )
         frame, state = state.correct(stated), replace(state, points=Points.none(), searchable=0)
         motion = self._at(frame, found.T_world_camera, found.covariance)
         measured = self._measure(frame, image, state, motion)
@@ -234,8 +237,7 @@ class Tracker:
         is_due = lost == 0 or (lost % first == 0 and (lost // first).bit_count() == 1)
         if self._landmarks is None and not is_due:
             return None
-        T = None if predicted is None else predicted.T_world_camera
-        problem = self.localizer.problem(frame, T if is_due else None)
+        problem = self.localizer.problem(frame, predicted.T_world_camera if predicted is not None and is_due else None)
         if self.localizer.matcher is not None and not is_due:
             problem = replace(problem, sensor=self.localizer.depth_sensor)
             return within_limits(localize_by_landmarks(problem, 0, state.frames), self.localizer.config)

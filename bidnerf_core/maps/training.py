@@ -191,8 +191,10 @@ def train(
             log.info(f"{read.where}: the map's own coordinates begin at {origin}, near its cameras")
         read = read.about(origin)
         if not any(view.frame.has_depth for view in read.views):
-            part = f" in split {images.split!r}" if read.source else ""
-            log.info(f"{read.where}: no measured depth{part}; training on colour only")
+            log.info(
+                f"{read.where}: no measured depth{f' in split {images.split!r}' if read.source else ''}; training on"
+                " colour only"
+            )
         taken = prepare_views(
             read.views,
             options.refine_poses,
@@ -227,8 +229,8 @@ def train(
         scene = Map(info, NoField())
         # A map that is already there stays until the first checkpoint.
         if baking is not None and folder is not None and not (folder / DESCRIPTION).exists():
-            begun = TrainingState(0, {}, _stored_tracks(taken.tracked))
-            scene = replace(scene, info=write_parts(folder, info, begun), folder=folder)
+            info = write_parts(folder, info, TrainingState(0, {}, _stored_tracks(taken.tracked)))
+            scene = replace(scene, info=info, folder=folder)
         return _complete(scene, taken.views, taken.tracked, options, baking, out=folder)
 
 
@@ -321,8 +323,9 @@ def resume(
             if not info.complete:
                 log.info(f"{out}: ends with the {amount(info.step, 'step')} done so far")
                 field = cast(nn.Module, trained_field(scene.field)).state_dict()
-                done = replace(info, complete=True)  # the state that resuming would need is dropped
-                scene = replace(scene, info=write_parts(out, done, TrainingState(info.step, field, {}), keep=True))
+                info = replace(info, complete=True)  # the state that resuming would need is dropped
+                info = write_parts(out, info, TrainingState(info.step, field, {}), keep=True)
+                scene = replace(scene, info=info)
             return _complete(scene, views, tracked, options, baking, out=out)
         scene, state = Map(info, NoField(), None, read_part(out, info, "landmarks"), out), None
         if info.step:

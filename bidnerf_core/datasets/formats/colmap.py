@@ -140,8 +140,10 @@ def _largest(path: Path, models: Sequence[Path]) -> tuple[Path, list[ModelImage]
     read = {model: read_posed_images(model) for model in models}
     chosen = max(models, key=lambda model: len(read[model][0]))
     if len(models) > 1:
-        count = {model: amount(len(images), "image") for model, (images, _) in read.items()}
-        sizes = {model: f"{model.relative_to(path)} with {count[model]}" for model in models}
+        sizes = {
+            model: f"{model.relative_to(path)} with {amount(len(images), 'image')}"
+            for model, (images, _) in read.items()
+        }
         used = sizes.pop(chosen)
         warn_about(
             path,

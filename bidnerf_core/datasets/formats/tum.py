@@ -65,8 +65,8 @@ def _read(path: Path, colour_list: Path, options: DatasetOptions) -> Capture:
         given = _published_camera(str(given), whole=True) or given
     sensors = "freiburg1, freiburg2 and freiburg3"
     unknown, ways = f"its name contains none of {sensors}", f"one of {sensors}, or a file"
-    published, is_needed = _published_camera(path.resolve().name), trajectory is not None
-    camera = folder_camera(path, given, published, unknown, ways, is_needed)
+    published = _published_camera(path.resolve().name)
+    camera = folder_camera(path, given, published, unknown, ways, trajectory is not None)
     sensor, unit = options.sensor(path), options.depth_unit or 1 / 5000
     depth_list, read_depth = path / "depth.txt", DepthReader(documented=("65535",))
     images = [_file(row, names) for row in colours]
