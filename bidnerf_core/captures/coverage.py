@@ -178,8 +178,10 @@ def shows_distances(views: Sequence[View], tracked: TrackedViews | None) -> bool
         return False
     if tracked is None or not tracked.matched.count:
         return True
-    has_parallax = _median(_cones_deg(tracked.matched)) >= DEFAULT_LANDMARKS.parallax
-    return has_parallax or len(tracked.triangulate(DEFAULT_LANDMARKS)[1]) >= 50
+    return (
+        _median(_cones_deg(tracked.matched)) >= DEFAULT_LANDMARKS.parallax
+        or len(tracked.triangulate(DEFAULT_LANDMARKS)[1]) >= 50
+    )
 
 
 def _cones_deg(seen: TrackedKeypoints) -> Float[Tensor, "n"]:

@@ -120,16 +120,19 @@ class CaptureReport:
 
     def scaled(self, factor: float) -> CaptureReport:
         """Return the report with all lengths multiplied by ``factor``."""
-        photos = tuple(
-            replace(
-                photo,
-                position=scale_point(photo.position, factor),
-                pose_translation=None if photo.pose_translation is None else photo.pose_translation * factor,
-            )
-            for photo in self.photos
+        return replace(
+            self,
+            photos=tuple(
+                replace(
+                    photo,
+                    position=scale_point(photo.position, factor),
+                    pose_translation=None if photo.pose_translation is None else photo.pose_translation * factor,
+                )
+                for photo in self.photos
+            ),
+            coverage=replace(self.coverage, centre=scale_point(self.coverage.centre, factor)),
+            trial=self.trial.scaled(factor),
         )
-        coverage = replace(self.coverage, centre=scale_point(self.coverage.centre, factor))
-        return replace(self, photos=photos, coverage=coverage, trial=self.trial.scaled(factor))
 
 
 def summary(report: CaptureReport) -> list[str]:

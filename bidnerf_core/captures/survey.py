@@ -110,9 +110,13 @@ def survey_capture(
         )
     wrong = {"mirrored", "turned", "badly posed", "apart"}
     sound = [v for v, photo in zip(views, photos, strict=True) if not wrong & set(photo.problems)] or views
-    covered = coverage(sound, tracked.matched, seen, positions, config.parallax, up)
     low, high = exposure.nan_to_num().quantile(torch.tensor([0.1, 0.9], dtype=exposure.dtype))
-    return CaptureReport(tuple(photos), covered, trial or HeldOutTrial(), float(high - low))
+    return CaptureReport(
+        tuple(photos),
+        coverage(sound, tracked.matched, seen, positions, config.parallax, up),
+        trial or HeldOutTrial(),
+        float(high - low),
+    )
 
 
 def _by_own_landmarks(
@@ -146,8 +150,10 @@ def link_photos(seen: TrackedKeypoints) -> csr_array:
     different places may share one by chance, but rarely two, since a match must lie on the epipolar line, stand out from
     all others, and yield a point in front of both cameras.
     """
-    shape = (len(seen.images), max(1, seen.count))
-    shows = csr_array((np.ones(len(seen.point), np.int32), (seen.image.numpy(), seen.point.numpy())), shape=shape)
+    shows = csr_array(
+        (np.ones(len(seen.point), np.int32), (seen.image.numpy(), seen.point.numpy())),
+        shape=(len(seen.images), max(1, seen.count)),
+    )
     shared = (shows @ shows.T).tocoo()
     row, column = shared.coords
     enough = (shared.data >= 5) & (row != column)
@@ -217,8 +223,10 @@ def _has_support(images: Sequence[ImageKeypoints], links: csr_array, number: int
     Matches are found without using the poses, so a wrong pose agrees with none of the linked photos.
     """
     poses, needed = SE3.stack([image.T_ref_camera for image in images]), LEAST_GROUP - 1
-    others = links.indices[links.indptr[number] : links.indptr[number + 1]].tolist()
-    pairs = (match_pair(images, number, other) for other in others)
+    pairs = (
+        match_pair(images, number, other)
+        for other in links.indices[links.indptr[number] : links.indptr[number + 1]].tolist()
+    )
     agreeing = (pair for pair in pairs if pair is not None and bool(pair.agreeing(poses[None])[0]))
     return len(list(islice(agreeing, needed))) == needed
 

@@ -227,8 +227,11 @@ def training_poses(
     standard deviation of the keypoints; otherwise they are kept.
     """
     seen, _ = tracked.triangulate(config)
-    elsewhere = relocate_photos(tracked, views, suspects(seen, link_photos(seen)), config)
-    wrong = {i: photo for i, photo in elsewhere.items() if photo.problem in ("badly posed", "turned")}
+    wrong = {
+        number: photo
+        for number, photo in relocate_photos(tracked, views, suspects(seen, link_photos(seen)), config).items()
+        if photo.problem in ("badly posed", "turned")
+    }
     if wrong:
         updates = torch.zeros(len(views), 6, dtype=torch.float64)
         for number, photo in wrong.items():
@@ -275,9 +278,13 @@ def adjust_poses(
         return None
     deviations, motion = _deviations(torch.stack(updates)), STILL
     for number in range(ROUNDS):
-        start = Adjustment(tracked.T_world_camera, points, tracked.observations.motion)
-        prior = PosePrior(given, *deviations, motion)
-        fit = adjust_bundle(seen.sightings, start, prior, noise_of(seen, points), KEYPOINTS_PER_INDEPENDENT)
+        fit = adjust_bundle(
+            seen.sightings,
+            Adjustment(tracked.T_world_camera, points, tracked.observations.motion),
+            PosePrior(given, *deviations, motion),
+            noise_of(seen, points),
+            KEYPOINTS_PER_INDEPENDENT,
+        )
         step = _image_motion(seen, fit.points, tracked.T_world_camera, fit.T_world_camera)
         moved = _deviations((given.inverse() @ fit.T_world_camera).log())
         deviations = max(deviations[0], moved[0]), max(deviations[1], moved[1])

@@ -120,9 +120,12 @@ def files_of(folder: Path, *names: str) -> list[Path] | None:
 
 def depth_map_of(model: Path, name: str) -> Path | None:
     """Return the depth map of an image of a model ``WORKSPACE/sparse`` or ``WORKSPACE/sparse/0``, or None."""
-    folders = (folder / "stereo/depth_maps" for folder in (model.parent, model.parent.parent))
-    kinds = ("geometric", "photometric")  # the more reliable one first
-    return next(filter(is_file, (folder / f"{name}.{kind}.bin" for folder in folders for kind in kinds)), None)
+    files = (
+        folder / f"stereo/depth_maps/{name}.{kind}.bin"
+        for folder in (model.parent, model.parent.parent)
+        for kind in ("geometric", "photometric")  # the more reliable one first
+    )
+    return next(filter(is_file, files), None)
 
 
 def read_colmap_depth(path: Path) -> DepthImage:
@@ -148,8 +151,14 @@ def _images(file: Path) -> list[ModelImage]:
         if not (np.isfinite(pose).all() and 0.5 < np.linalg.norm(quaternion) < 2):
             raise InputError(f"image {name!r} has an invalid pose", where=where, expected="a unit quaternion")
         rotation = torch.from_numpy(Rotation.from_quat(quaternion, scalar_first=True).as_matrix())
-        T = SE3(rotation, torch.tensor(translation, dtype=torch.float64))
-        images.append(ModelImage(name, camera, T, torch.from_numpy(observed.astype(np.int64))))
+        images.append(
+            ModelImage(
+                name,
+                camera,
+                SE3(rotation, torch.tensor(translation, dtype=torch.float64)),
+                torch.from_numpy(observed.astype(np.int64)),
+            )
+        )
     return images
 
 

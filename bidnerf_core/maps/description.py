@@ -63,10 +63,6 @@ class Anchor(Settings):
             raise InputError(where="T_enu_world", expected="4 rows of 4 numbers")
         return pose_from_matrix(torch.tensor(rows, dtype=torch.float64), "T_enu_world")
 
-    def scaled(self, factor: float) -> Anchor:
-        """Return the anchor for the same map with all lengths multiplied by ``factor``."""
-        return replace(self, metres_per_unit=self.metres_per_unit / factor)
-
 
 @dataclass(frozen=True)
 class FieldFrame(Settings):
@@ -133,7 +129,9 @@ class MapInfo:
             unit=unit,
             origin=scale_point(self.origin, factor),
             field_frame=None if scale == 1 else replace(frame, scale=scale),
-            anchor=None if self.anchor is None else self.anchor.scaled(factor),
+            anchor=None
+            if self.anchor is None
+            else replace(self.anchor, metres_per_unit=self.anchor.metres_per_unit / factor),
         )
 
     def in_map_unit(self, field: RadianceField) -> RadianceField:

@@ -282,8 +282,7 @@ def _train_further(scene: Map, views: Sequence[View], steps: int | None, share: 
     if that is more.
     """
     info, field = scene.info, trained_field(scene.field)
-    backend = load_backend(info.backend, str(scene.folder or ""))
-    settings: Any = from_plain(backend.config_type, info.config, "config")
+    settings: Any = from_plain(load_backend(info.backend, str(scene.folder or "")).config_type, info.config, "config")
     usual = getattr(settings, "steps", None)
     if isinstance(usual, int):
         settings = replace(settings, steps=steps or max(1, math.ceil(usual * max(share, 0.25))))
@@ -307,9 +306,11 @@ def _train_further(scene: Map, views: Sequence[View], steps: int | None, share: 
             )
             for view in views
         ]
-    restarted = replace(info, step=0, complete=False, config=to_plain(settings, "config"))
     grown = train_field(
-        views, Map(restarted, NoField()), TrainOptions(device=device_of(scene.field)), weights=field.state_dict()
+        views,
+        Map(replace(info, step=0, complete=False, config=to_plain(settings, "config")), NoField()),
+        TrainOptions(device=device_of(scene.field)),
+        weights=field.state_dict(),
     )
     info = replace(info, step=info.step + grown.info.step, seconds=grown.info.seconds)
     return replace(scene, info=info, field=grown.field, folder=None, record=scene.capture)

@@ -306,8 +306,9 @@ def viewpoints(
     ``up`` is the up direction in the images. The inside of an ``is_solid`` object does not count as free space,
     although rays hit nothing there. The result is deterministic.
     """
-    generator = torch.Generator().manual_seed(0)
-    places = torch.tensor(bounds.lower) + torch.tensor(bounds.size) * torch.rand((400, 3), generator=generator)
+    places = torch.tensor(bounds.lower) + torch.tensor(bounds.size) * torch.rand(
+        (400, 3), generator=torch.Generator().manual_seed(0)
+    )
     distance = _distances(field, bounds, places)
     hit = distance > 0
     nearest = torch.where(hit, distance, torch.inf).quantile(0.1, dim=1)  # exceeded by nine out of ten rays

@@ -147,8 +147,11 @@ def _seen_at(scene: Map, camera: StoredCamera, u: float, v: float) -> Float[Tens
     direction = camera.pose.rotate(ray / ray.norm(dim=-1, keepdim=True))
     origin = camera.pose.translation[None]
     device = device_of(scene.field)
-    rays = scene.bounds.rays(origin.float().to(device), direction.float().to(device))
-    shown = render(scene.field, rays, scene.bounds.background)
+    shown = render(
+        scene.field,
+        scene.bounds.rays(origin.float().to(device), direction.float().to(device)),
+        scene.bounds.background,
+    )
     if float(shown.opacity[0]) < 0.5:
         raise InputError(f"{camera.name}@{u:g},{v:g} shows the background", expected="a pixel that shows the scene")
     return origin[0] + float(shown.distance[0] / shown.opacity[0]) * direction[0]

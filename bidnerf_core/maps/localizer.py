@@ -250,8 +250,8 @@ class Localizer:
         bounds, field = self.scene.bounds, self.scene.field
         directions = torch.eye(3, device=device_of(field))
         if has_field(field):
-            middle = constant(bounds.centre, directions)
-            render(field, bounds.rays(middle - directions * bounds.near, directions), bounds.background)
+            origins = constant(bounds.centre, directions) - directions * bounds.near
+            render(field, bounds.rays(origins, directions), bounds.background)
         if self.scene.surface is not None:
             self.scene.surface.warm_up()
 

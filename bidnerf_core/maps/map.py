@@ -384,8 +384,12 @@ class Map:
         check_cancelled("survey")
         if tracked is None:
             tracked = track_views(views, self.info.landmark_features)
-        noise = colour_noise(self.field, self.bounds, views) if self.has_field else None
-        scene = replace(self, info=replace(self.info, colour_noise=noise))
+        scene = replace(
+            self,
+            info=replace(
+                self.info, colour_noise=colour_noise(self.field, self.bounds, views) if self.has_field else None
+            ),
+        )
         counter("surveying the photos", "stage")(0, 1)
         landmarks = self.landmarks
         if landmarks is not None:

@@ -73,8 +73,9 @@ class Tracker:
         self.localizer, config = localizer, TrackerConfig() if config is None else config
         self._scene = localizer.scene
         if not self._scene.has_distances:
-            found = f"tracking needs positions, but {NO_DISTANCES};"
-            raise InputError(found, expected="a map of photos from several places")
+            raise InputError(
+                f"tracking needs positions, but {NO_DISTANCES};", expected="a map of photos from several places"
+            )
         self._state = TrackerState(Clock(None, config.frame_seconds))
         self._origin = origin_of(self._scene)
         self._start = None if start is None else start_pose(start).translated(-self._origin)

@@ -160,10 +160,9 @@ def _image_folder(
 
     If none of the usual folders holds half of the images, they are looked for below ``path``, or in the ``given`` folder alone.
     """
-    beside = [model.parent / "images", model.parent.parent / "images"]
-    folders = list(dict.fromkeys([*beside, *(path / name for name in IMAGE_FOLDERS)])) if given is None else []
+    usual = (model.parent / "images", model.parent.parent / "images", *map(path.joinpath, IMAGE_FOLDERS))
     best: tuple[Path, dict[str, Path]] = (path / IMAGE_FOLDERS[0], {})
-    for folder in filter(Path.is_dir, folders):
+    for folder in filter(Path.is_dir, dict.fromkeys(usual) if given is None else ()):
         names = FileNames(folder)
         files = {image.name: file for image in images if (file := names.find(posix_name(image.name))) is not None}
         if len(files) > len(best[1]):

@@ -103,8 +103,14 @@ def _read(path: Path, folder: Path, options: DatasetOptions) -> Capture:
 
 def _find(path: Path) -> Path | None:
     """Return the folder of the files: the given one, or that of ScanNet++."""
-    folders = (path, path / "nerfstudio", path / "dslr/nerfstudio")
-    return next((f for f in folders if first_file(f, "transforms.json", *SPLIT_FILES.values())), None)
+    return next(
+        (
+            folder
+            for folder in (path, path / "nerfstudio", path / "dslr/nerfstudio")
+            if first_file(folder, "transforms.json", *SPLIT_FILES.values())
+        ),
+        None,
+    )
 
 
 def _first_size(frames: Sequence[FrameRecord], images: Sequence[Path]) -> tuple[int, int] | None:
