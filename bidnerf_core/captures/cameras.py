@@ -220,7 +220,8 @@ def write_inria_cameras(
 ) -> list[Path]:
     """Write ``cameras.json`` to ``folder`` and return its path in a list; write nothing if there are no cameras.
 
-    Positions are written relative to the world, in which those of the cameras are relative to ``origin`` (by default 0). The format stores no principal points; readers take the image centres instead.
+    The positions of the cameras are relative to ``origin`` (world, by default 0), those in the file are not. The format
+    stores no principal points; readers take the image centres instead.
     """
     if not cameras:
         return []

@@ -346,11 +346,12 @@ class Map:
         config: BakeConfig,
         scan: tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]] | None = None,
     ) -> Map:
-        """Return the map with a new surface, baked from the points of a ``scan`` (metres, world) and their colours, if given.
+        """Return the map with a new surface.
 
-        Otherwise, baking uses the measured depth of the views, or else depth rendered by the field from the map's cameras or,
-        if it has none, from those of the views. Raises ``InputError`` if there are no cameras at all, and if the
-        images do not agree on a surface.
+        It is baked from the points of a ``scan`` (metres, world) and their colours, if given, otherwise from the
+        measured depth of the views, or else from depth rendered by the field at the map's cameras or, if it has none,
+        at those of the views. Raises ``InputError`` if there are no cameras at all, and if the images do not agree on
+        a surface.
         """
         check_cancelled("surface")
         started = time.monotonic()
