@@ -274,9 +274,11 @@ def _report_extent(found: ImportedField, where: str, unit: LengthUnit) -> None:
     log.info(f"{where}: extent {extent}{' metres' if unit == 'metres' else unknown}")
     # The longest side of a plausible scene is between 5 cm and 500 m; other lengths are probably in another unit.
     if not 0.05 <= max(size) <= 500:
-        doubt = "tiny in metres; are its lengths kilometres or an arbitrary unit?"
-        if max(size) > 500:
-            doubt = "very large in metres; are its lengths millimetres?"
+        doubt = (
+            "very large in metres; are its lengths millimetres?"
+            if max(size) > 500
+            else "tiny in metres; are its lengths kilometres or an arbitrary unit?"
+        )
         warnings.warn(f"{where}: {extent} would be {doubt} `scale` changes them", InputWarning, stacklevel=3)
 
 

@@ -165,16 +165,17 @@ def train(
         open_posed_images(data, options.images, folder, options.overwrite, options.poser) as (posed, images),
     ):
         if known is not None and folder is not None:
-            scene, images = load_map(folder), replace(images, largest=longest_side(known))
-            read, views = views_again(known, posed, images, options.depth_points, options.point_choice, folder)
-            own = {camera.name for camera in known.cameras}
+            scene = load_map(folder)
+            images = replace(images, largest=longest_side(scene.info))
+            read, views = views_again(scene.info, posed, images, options.depth_points, options.point_choice, folder)
+            own = {camera.name for camera in scene.info.cameras}
             if unknown := [view.frame.name for view in read.views if view.frame.name not in own]:
                 raise InputError(
                     f"image {unknown[0]!r} is none of those of {scene.name}",
                     where=read.where,
                     expected="images of that map",
                 )
-            tracked, views = track_landmarks(views, known.landmark_features, True, read.depth_unit)
+            tracked, views = track_landmarks(views, scene.info.landmark_features, True, read.depth_unit)
             info = replace(
                 scene.info,
                 backend=backend,
