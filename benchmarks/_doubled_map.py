@@ -16,7 +16,7 @@ from bidnerf import Map
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import FieldValues, RadianceField, Rays, RaySamples, SceneBounds
 from bidnerf_core.geometry import SE3
-from bidnerf_core.mapping import LandmarkMap
+from bidnerf_core.mapping import LandmarkMap, concatenate
 
 DESCRIPTOR_NOISE = 5.0
 """Standard deviation of the noise in each channel of a descriptor, whose values range from 0 to 255."""
@@ -69,26 +69,16 @@ def double(map: Map, T_world_copy: SE3) -> Map:
     return replace(map, info=info, field=field, surface=None, landmarks=twice(map.landmarks, T_world_copy))
 
 
-def twice(landmarks: LandmarkMap, T_world_copy: SE3, share: float = 1.0) -> LandmarkMap:
-    """Return landmarks of which a random share is repeated elsewhere; the descriptors of all get noise."""
+def twice(landmarks: LandmarkMap, T_world_copy: SE3) -> LandmarkMap:
+    """Return landmarks that are repeated elsewhere, seen by other images; the descriptors of all get noise."""
     T, generator = T_world_copy.to("cpu", torch.float32), Generator().manual_seed(0)
-    chosen = torch.rand(len(landmarks), generator=Generator().manual_seed(1)) < share
-
-    def with_chosen(here: Tensor, there: Tensor | None = None) -> Tensor:
-        return torch.cat([here, (here if there is None else there)[chosen]])
-
-    descriptors = with_chosen(landmarks.descriptors)
-    noise = DESCRIPTOR_NOISE * torch.randn(descriptors.shape, generator=generator)
-    return replace(
-        landmarks,
-        positions=with_chosen(landmarks.positions, T.apply(landmarks.positions)),
-        directions=with_chosen(landmarks.directions, T.rotate(landmarks.directions)),
-        descriptors=(descriptors + noise).round().clamp(0, 255).to(descriptors.dtype),
-        deviations=with_chosen(landmarks.deviations),
-        cones=with_chosen(landmarks.cones),
-        sizes=with_chosen(landmarks.sizes),
-        views=with_chosen(landmarks.views),
-    )
+    copy = replace(landmarks, positions=T.apply(landmarks.positions), directions=T.rotate(landmarks.directions))
+    if (tracks := landmarks.tracks) is not None:
+        copy = replace(copy, tracks=replace(tracks, image=tracks.image + int(tracks.image.max()) + 1))
+    both = concatenate([landmarks, copy])
+    noise = DESCRIPTOR_NOISE * torch.randn(both.descriptors.shape, generator=generator)
+    descriptors = (both.descriptors + noise).round().clamp(0, 255).to(both.descriptors.dtype)
+    return replace(both, descriptors=descriptors, descriptor_cells=None).indexed()
 
 
 def far_away(bounds: SceneBounds) -> SE3:
