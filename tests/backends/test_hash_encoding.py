@@ -6,6 +6,7 @@ import itertools
 import os
 from functools import partial
 from typing import Literal
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -222,11 +223,8 @@ def test_the_number_of_threads_does_not_change_the_result(monkeypatch: pytest.Mo
 
 
 def test_an_error_in_a_thread_is_raised() -> None:
-    def fails() -> None:
-        raise ValueError("of a task")
-
     with pytest.raises(ValueError, match="of a task"):
-        concurrently([fails, fails], threads=2)
+        concurrently([Mock(side_effect=ValueError("of a task"))] * 2, threads=2)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")

@@ -62,11 +62,10 @@ def test_agrees_with_the_modules(count: int, colour_layers: int) -> None:
 def test_derivatives_equal_numerical_ones() -> None:
     geometry, colour = made()
     parameters = [*geometry.parameters(), *colour.parameters()]
-
-    def function(encoded: Tensor, harmonics: Tensor, *_: Tensor) -> tuple[Tensor, Tensor]:
-        return log_density_and_rgb(geometry, colour, encoded, harmonics)
-
-    assert torch.autograd.gradcheck(function, (*inputs(11), *parameters))
+    assert torch.autograd.gradcheck(
+        lambda encoded, harmonics, *_: log_density_and_rgb(geometry, colour, encoded, harmonics),
+        (*inputs(11), *parameters),
+    )
 
 
 @pytest.mark.parametrize("frozen", ["networks", "inputs", "encoding", "all but one weight"])

@@ -54,11 +54,6 @@ def scene(rays: np.ndarray) -> np.ndarray:
     return np.stack([127 + 100 * np.sin(3 * x), 127 + 100 * np.sin(4 * y), 127 + 100 * z], axis=-1)
 
 
-def rays_of(camera: Intrinsics, rotation: np.ndarray | None = None) -> np.ndarray:
-    rays = camera.unproject(camera.pixel_centres(torch.float64)).numpy()
-    return rays if rotation is None else rays @ rotation.T
-
-
 def photo_of(lens: Lens) -> np.ndarray:
     """The image that the lens takes of the scene, by pycolmap's inverse of its projection."""
     assert isinstance(lens, CentralLens)
@@ -77,7 +72,8 @@ def panorama(width: int) -> np.ndarray:
 
 def error_of(frame: Frame, rotation: np.ndarray | None = None) -> float:
     """The largest difference (of 255) between a frame and the scene, over pixels that are not hidden."""
-    expected = scene(rays_of(frame.intrinsics, rotation))
+    rays = frame.intrinsics.unproject(frame.intrinsics.pixel_centres(torch.float64)).numpy()
+    expected = scene(rays if rotation is None else rays @ rotation.T)
     wrong = np.abs(frame.rgb.numpy() * 255 - expected).max(-1)
     return float(wrong[~frame.hidden.numpy()].max() if frame.hidden is not None else wrong.max())
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from jaxtyping import Float
 from PIL import Image, ImageOps
 from PIL.ExifTags import Base
-from torch import Tensor
 
 from bidnerf_core.camera import UPRIGHT, Intrinsics, Orientation
 from refusals import refused
@@ -28,15 +26,6 @@ def turned_by_pillow(image: np.ndarray, code: int) -> np.ndarray:
     stored = Image.fromarray(image)
     stored.info["exif"] = exif.tobytes()
     return np.asarray(ImageOps.exif_transpose(stored))
-
-
-def landing(code: int) -> Float[Tensor, "n 2"]:
-    """Where Pillow puts the centre of each pixel of the stored raster, row by row."""
-    numbers = np.arange(WIDTH * HEIGHT, dtype=np.uint8).reshape(HEIGHT, WIDTH)
-    rows, columns = np.divmod(
-        np.argsort(turned_by_pillow(numbers, code).reshape(-1)), turned_by_pillow(numbers, code).shape[1]
-    )
-    return torch.from_numpy(np.stack([columns, rows], axis=-1) + 0.5)
 
 
 @pytest.mark.parametrize("code", CODES)
@@ -59,7 +48,10 @@ def test_a_camera_sees_each_pixel_in_the_same_direction_up_to_the_turn(code: int
     stored = Intrinsics(11.0, 12.0, 4.0, 3.4, WIDTH, HEIGHT, LENSES[lens])
     upright = stored.upright(Orientation.from_exif(code))
     pixels = stored.pixel_centres(torch.float64).reshape(-1, 2)
-    there = landing(code)
+    # Where Pillow puts the centre of each pixel of the stored raster, row by row.
+    numbers = turned_by_pillow(np.arange(WIDTH * HEIGHT, dtype=np.uint8).reshape(HEIGHT, WIDTH), code)
+    rows, columns = np.divmod(np.argsort(numbers.reshape(-1)), numbers.shape[1])
+    there = torch.from_numpy(np.stack([columns, rows], axis=-1) + 0.5)
     turn = torch.linalg.lstsq(pixels - pixels.mean(0), there - there.mean(0)).solution
     torch.testing.assert_close(Orientation.from_exif(code).axes[:2, :2], turn.mT, atol=1e-9, rtol=0)
     expected = stored.unproject(pixels)[:, :2] @ turn

@@ -85,22 +85,19 @@ def test_a_few_landmarks_give_no_box() -> None:
     assert estimate_bounds(few) == estimate_bounds(bare)
 
 
-def walls(*distances: float, rows: int = 48) -> list[View]:
-    """Views of walls at these distances, each with a nearer object in a quarter of it, through a lens with unequal focal lengths."""
-    camera = replace(CAMERA, fx=50.0, fy=70.0)
-    views = []
-    for distance in distances:
+@pytest.mark.parametrize("rows", [48, 1])
+def test_measured_depth_determines_what_a_pixel_shows(rows: int) -> None:
+    """The mean focal length is 60 px, and the middle one of three walls is two metres away.
+
+    Each has a nearer object in a quarter of it.
+    """
+    camera, views = replace(CAMERA, fx=50.0, fy=70.0), list[View]()
+    for distance in (1.0, 2.0, 9.0):
         depth = torch.full((48, 64), distance)
         depth[:, :16] = distance / 2
         depth[rows:] = 0
         views.append(View(Frame(f"{distance}", torch.zeros(48, 64, 3), camera, depth), SE3.identity()))
-    return views
-
-
-@pytest.mark.parametrize("rows", [48, 1])
-def test_measured_depth_determines_what_a_pixel_shows(rows: int) -> None:
-    """The mean focal length is 60 px, and the middle one of three walls is two metres away."""
-    assert estimate_bounds(walls(1.0, 2.0, 9.0, rows=rows)).footprint == pytest.approx(2 / 60)
+    assert estimate_bounds(views).footprint == pytest.approx(2 / 60)
 
 
 def test_landmarks_tell_what_a_pixel_shows() -> None:

@@ -132,15 +132,11 @@ def test_two_views_must_agree_where_there_are_two() -> None:
     assert torch.equal(again, occupied_cells([free], LOWER, UPPER, SHAPE))
 
 
-def test_colour_alone_empties_nothing() -> None:
-    assert occupied_cells(ball_views(depth=False, alpha=False), LOWER, UPPER, SHAPE).all()
-    assert occupied_cells([], LOWER, UPPER, SHAPE).all()
-
-
-def test_soft_edges_are_matter() -> None:
+def test_colour_alone_and_soft_edges_empty_nothing() -> None:
     view = ball_view((4, 0, 0))
     soft = replace(view, frame=replace(view.frame, alpha=torch.full((48, 64), 0.01)))
-    assert occupied_cells([soft], LOWER, UPPER, SHAPE).all()
+    for views in (ball_views(depth=False, alpha=False), [], [soft]):
+        assert occupied_cells(views, LOWER, UPPER, SHAPE).all()
 
 
 def test_order_of_views_does_not_matter() -> None:

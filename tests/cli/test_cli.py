@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import imageio.v3 as iio
 import numpy as np
@@ -157,11 +158,6 @@ def weighted(change: Callable[[dict[str, torch.Tensor]], Any]) -> Edit:
     return edit
 
 
-def empty(folder: Path) -> None:
-    for file in folder.iterdir():
-        file.unlink()
-
-
 def into_a_file(folder: Path) -> None:
     shutil.rmtree(folder)
     folder.touch()
@@ -193,7 +189,7 @@ def test_a_map_that_cannot_be_used_is_told_in_a_line(
 
 BIAS = "geometry.0.bias"
 FAULTS: dict[str, tuple[Edit, tuple[str, ...]]] = {
-    "empty folder": (empty, ("no map.json",)),
+    "empty folder": (lambda folder: [file.unlink() for file in folder.iterdir()], ("no map.json",)),
     "a file": (into_a_file, ("is a file", "a folder")),
     "another format": (described(lambda c: c.update(format="x")), ("map.json", "bidnerf map")),
     "newer": (described(lambda c: c.update(version=99)), ("map.json", "version 99", "upgrade bidnerf")),
@@ -279,10 +275,6 @@ def test_a_place_that_cannot_be_written_is_told_before_any_work(
     assert contents(tmp_path) == {"file": b""}
 
 
-def no_space(*_: object) -> None:
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
 def no_memory(*_: object) -> None:
     raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.\nSee the notes")
 
@@ -298,7 +290,7 @@ def test_a_gpu_without_memory_left_is_said_in_a_line(
 def test_a_full_disk_leaves_nothing_behind(
     bidnerf: Run, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(os, "fsync", no_space)
+    monkeypatch.setattr(os, "fsync", Mock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))))
     out = tmp_path / "some" / "where"
     trained = bidnerf("train", shared / "data", "--out", out, *tiny.options(2))
     assert_refused(trained, 1, f"{out}/weights-", "No space left on device", after_remarks=True)
@@ -519,10 +511,7 @@ def test_ctrl_c_saves_and_resuming_loses_nothing(
 def test_ctrl_c_before_anything_is_made_leaves_nothing(
     bidnerf: Run, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("bidnerf_core.maps.training.read_views", interrupt)
+    monkeypatch.setattr("bidnerf_core.maps.training.read_views", Mock(side_effect=KeyboardInterrupt))
     outcome = bidnerf("train", shared / "data", "--out", tmp_path / "map")
     assert (outcome.status, outcome.err) == (130, "bidnerf train: interrupted\n")
     assert list(tmp_path.iterdir()) == []

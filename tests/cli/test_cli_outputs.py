@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -83,17 +84,6 @@ def third(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[], object]], N
     return at_third
 
 
-def no_space(*_: object, **__: object) -> None:
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
-def raising(error: BaseException) -> Callable[[], None]:
-    def act() -> None:
-        raise error
-
-    return act
-
-
 @pytest.fixture
 def no_signal_ignored() -> Iterator[None]:
     """Signals as in a terminal, also where the tests run in the background, which ignores some of them."""
@@ -112,8 +102,8 @@ def no_signal_ignored() -> Iterator[None]:
         (lambda: os.kill(os.getpid(), signal.SIGTERM), 143),
         (lambda: os.kill(os.getpid(), signal.SIGHUP), 129),
         (lambda: os.kill(os.getpid(), signal.SIGINT), 130),
-        (raising(BrokenPipeError()), 141),
-        (no_space, 1),
+        (Mock(side_effect=BrokenPipeError), 141),
+        (Mock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))), 1),
     ],
     ids=["SIGTERM", "SIGHUP", "SIGINT", "closed pipe", "full disk"],
 )
@@ -320,9 +310,7 @@ def test_a_file_that_is_read_or_of_a_map_is_no_output(files: Path, out: str) -> 
 def test_a_folder_in_which_no_file_can_be_created_is_refused_before_any_work(
     bidnerf: Run, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(**_: object) -> None:
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
-
+    refuse = Mock(side_effect=OSError(errno.EROFS, os.strerror(errno.EROFS)))
     monkeypatch.setattr("tempfile.TemporaryFile", refuse)
     for words in (
         ["localize", "MAP", data, "--out", tmp_path / "poses.json"],
@@ -356,9 +344,7 @@ def test_what_a_format_or_a_page_needs_is_checked_before_a_map_is_loaded(
         """A mesh."""
         raise AssertionError
 
-    def load(*_: object) -> None:
-        raise AssertionError("loaded")
-
+    load = Mock(side_effect=AssertionError("loaded"))
     vars(write)["needs"] = ("surface",)
     monkeypatch.setitem(registered, ("exporters", "mesh.new"), write)
     monkeypatch.setattr("bidnerf.results.export.load_map", load)

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,49 +44,37 @@ from scan_layouts import (
 
 COUNT = 4
 JSON = "transforms.json"
-Write = Callable[[Path], Path]
+Write = Callable[[Path, Any], Path]
+Edit = Callable[[Path], object]
 
 
-def moved(to: str) -> Write:
+def moved(to: str, folder: Path) -> None:
     """Paths relative to the folder in which the converter ran; the photos lie in ``to`` beside the file."""
-
-    def write(root: Path) -> Path:
-        folder = write_nerfstudio(root, small_views(COUNT))
-        for number in range(COUNT):
-            edit_frame(folder / JSON, number, file_path=f"./data/desk/images/r_{number}.png", depth_file_path=None)
-        (folder / to).mkdir(exist_ok=True)
-        for image in (folder / "images").iterdir():
-            image.rename(folder / to / image.name)
-        return folder
-
-    return write
+    for number in range(COUNT):
+        edit_frame(folder / JSON, number, file_path=f"./data/desk/images/r_{number}.png", depth_file_path=None)
+    (folder / to).mkdir(exist_ok=True)
+    for image in (folder / "images").iterdir():
+        image.rename(folder / to / image.name)
 
 
-def companions(write: Callable[[Path, Any], Path]) -> Write:
+def companions(folder: Path) -> None:
     """Every file with the companion that macOS writes to other file systems."""
-
-    def copied(root: Path) -> Path:
-        folder = write(root, small_views(COUNT))
-        for file in [file for file in root.rglob("*") if file.is_file()]:
-            file.with_name(f"._{file.name}").write_bytes(b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X")
-        return folder
-
-    return copied
+    for file in [file for file in folder.rglob("*") if file.is_file()]:
+        file.with_name(f"._{file.name}").write_bytes(b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X")
 
 
-def empty_columns(root: Path) -> Path:
-    """Write what Stray Scanner writes since 2026; the second frame has no pose, and the third no lens of its own."""
-    file = write_stray_scanner(root, small_views(COUNT + 1)) / "odometry.csv"
+def empty_columns(folder: Path) -> None:
+    """What Stray Scanner writes since 2026; the second frame has no pose, and the third no lens of its own."""
+    file = folder / "odometry.csv"
     head, *rows = file.read_text().splitlines()
     rows = [f"{row}, 20, 21, 8, 5.75, , " for row in rows]
     rows[1] = ", ".join([*rows[1].split(", ")[:2], *[""] * 7, *rows[1].split(", ")[9:]])
     rows[2] = rows[2].replace(", 20, 21, 8, 5.75", ", , , , ")
     columns = ", fx, fy, cx, cy, distortion_center_x, distortion_center_y"
     file.write_text("\n".join([head + columns, *rows]) + "\n")
-    return root
 
 
-def dense_workspace(root: Path) -> Path:
+def dense_workspace(root: Path) -> None:
     """COLMAP's automatic reconstruction whose photos lie elsewhere: only the undistorted images are there."""
     write_colmap(root / "dense/0", small_views(COUNT))
     (root / "dense/0/sparse/0").rename(root / "flat")
@@ -95,50 +84,40 @@ def dense_workspace(root: Path) -> Path:
     (other / "sparse").rename(root / "sparse")
     cameras = root / "sparse/0/cameras.txt"
     cameras.write_text(f"1 SIMPLE_RADIAL {SMALL.width} {SMALL.height} 20 8 6 -0.18\n")
-    return root
 
 
-def reduced_only(write: Callable[[Path, Any], Path]) -> Write:
+def reduced_only(folder: Path) -> None:
     """Only images of half the size are there, in ``images_2``."""
-
-    def write_half(root: Path) -> Path:
-        folder = write(root, small_views(COUNT))
-        for image in (folder / "images").iterdir():
-            half = Image.open(image).reduce(2)
-            write_image(folder / "images_2" / image.name, np.asarray(half))
-            image.unlink()
-        (folder / "images").rmdir()
-        return folder
-
-    return write_half
+    for image in (folder / "images").iterdir():
+        half = Image.open(image).reduce(2)
+        write_image(folder / "images_2" / image.name, np.asarray(half))
+        image.unlink()
+    (folder / "images").rmdir()
 
 
-def nanoseconds(root: Path) -> Path:
-    folder = write_nerfstudio(root, small_views(COUNT))
+def nanoseconds(folder: Path) -> None:
     for number in range(COUNT):
         edit_frame(folder / JSON, number, timestamp=1_403_636_579_000_000_000 + number * 50_000_000)
-    return folder
 
 
-def elsewhere(write: Callable[[Path, Any], Path], suffix: str = ".png") -> Write:
+def elsewhere(suffix: str, folder: Path) -> None:
     """The images lie in a folder of another name, as another format, beside pictures computed from them."""
-
-    def moved_there(root: Path) -> Path:
-        folder = write(root, small_views(COUNT))
-        for image in (folder / "images").iterdir():
-            write_image(folder / "masks_vis" / image.name, np.zeros((12, 16), np.uint8))
-            Image.open(image).save((folder / image.name).with_suffix(suffix))
-            image.unlink()
-            (folder / "colour" / "left").mkdir(parents=True, exist_ok=True)
-            (folder / image.name).with_suffix(suffix).rename(folder / "colour/left" / f"{image.stem}{suffix}")
-        return folder
-
-    return moved_there
+    for image in (folder / "images").iterdir():
+        write_image(folder / "masks_vis" / image.name, np.zeros((12, 16), np.uint8))
+        Image.open(image).save((folder / image.name).with_suffix(suffix))
+        image.unlink()
+        (folder / "colour" / "left").mkdir(parents=True, exist_ok=True)
+        (folder / image.name).with_suffix(suffix).rename(folder / "colour/left" / f"{image.stem}{suffix}")
 
 
-READ: dict[str, tuple[Write, str]] = {
+READ: dict[str, tuple[Write, Edit, str]] = {
+    # What writes the capture, what then happens to its folder, and the remark.
     **{
-        f"elsewhere, {write.__name__}": (elsewhere(write, suffix), f"is taken for colour/left/{first}{suffix}")
+        f"elsewhere, {write.__name__}": (
+            write,
+            partial(elsewhere, suffix),
+            f"is taken for colour/left/{first}{suffix}",
+        )
         for write, suffix, first in (
             (write_nerfstudio, ".jpg", "r_0"),
             (write_colmap, ".bmp", "r_0"),
@@ -146,27 +125,38 @@ READ: dict[str, tuple[Write, str]] = {
             (write_opensfm, ".jpg", "0"),
         )
     },
-    "moved": (moved("images"), "'./data/desk/images/r_0.png' is taken for images/r_0.png"),
-    "moved, flat": (moved("."), "is taken for r_0.png"),
-    "Polycam from a Mac": (companions(write_polycam), ""),
-    "COLMAP from a Mac": (companions(write_colmap), ""),
-    "Stray Scanner's empty columns": (empty_columns, "1 of 5 images have no pose"),
-    "dense workspace": (dense_workspace, "dense/0/images has a model of its own"),
-    "reduced copies alone, COLMAP": (reduced_only(write_colmap), ""),
-    "reduced copies alone, LLFF": (reduced_only(write_llff), ""),
+    "moved": (
+        write_nerfstudio,
+        partial(moved, "images"),
+        "'./data/desk/images/r_0.png' is taken for images/r_0.png",
+    ),
+    "moved, flat": (write_nerfstudio, partial(moved, "."), "is taken for r_0.png"),
+    "Polycam from a Mac": (write_polycam, companions, ""),
+    "COLMAP from a Mac": (write_colmap, companions, ""),
+    "Stray Scanner's empty columns": (
+        lambda root, _: write_stray_scanner(root, small_views(COUNT + 1)),
+        empty_columns,
+        "1 of 5 images have no pose",
+    ),
+    "dense workspace": (lambda root, _: root, dense_workspace, "dense/0/images has a model of its own"),
+    "reduced copies alone, COLMAP": (write_colmap, reduced_only, ""),
+    "reduced copies alone, LLFF": (write_llff, reduced_only, ""),
     "masks beside a model": (
-        lambda root: [write_colmap(root, small_views(COUNT)), (root / "masks").mkdir()][0] or root,
+        write_colmap,
+        lambda folder: (folder / "masks").mkdir(),
         "masks lies beside the images",
     ),
-    "times in nanoseconds": (nanoseconds, ""),
-    "ScanNet++": (lambda root: write_scannet_pp(root, small_views(COUNT)), ""),
+    "times in nanoseconds": (write_nerfstudio, nanoseconds, ""),
+    "ScanNet++": (write_scannet_pp, lambda folder: None, ""),
 }
 
 
 @pytest.mark.parametrize("kind", READ)
 def test_what_is_kept_otherwise_is_read(kind: str, tmp_path: Path) -> None:
-    write, expected = READ[kind]
-    remarks = remarks_of(folder := write(tmp_path))
+    write, edit, expected = READ[kind]
+    folder = write(tmp_path, small_views(COUNT))
+    edit(folder)
+    remarks = remarks_of(folder)
     assert len(remarks) == (expected != "")
     assert all(expected in remark for remark in remarks)
     views = read_all(folder)
@@ -233,7 +223,8 @@ def test_rows_of_llff_are_in_the_order_of_sorted(tmp_path: Path) -> None:
 
 
 def test_a_folder_of_images_is_named_where_several_fit(tmp_path: Path) -> None:
-    folder = elsewhere(write_colmap)(tmp_path)
+    folder = write_colmap(tmp_path, small_views(COUNT))
+    elsewhere(".png", folder)
     shutil.copytree(folder / "colour/left", folder / "colour/right")
     with refused(where=folder / "images/r_0.png", found="no such image"):
         read_all(folder)
@@ -245,77 +236,70 @@ def test_a_folder_of_images_is_named_where_several_fit(tmp_path: Path) -> None:
         open_dataset(write_scannet(tmp_path / "scannet", small_views(COUNT)), images=folder)
 
 
-def turned(root: Path) -> Path:
-    folder = write_nerfstudio(root, small_views(COUNT))
-    for view in small_views(COUNT):
-        write_image(folder / "images" / f"{view.frame.name}.png", np.rot90(pixels(view)).copy())
-    return folder
+def edit_text(file: Path, old: str, new: str) -> None:
+    file.write_text(file.read_text().replace(old, new))
 
 
-def far(root: Path) -> Path:
-    folder = write_nerfstudio(root, small_views(COUNT))
-    matrix = np.eye(4)
-    matrix[0, 3] = 1e30
-    edit_frame(folder / JSON, 2, transform_matrix=matrix.tolist())
-    return folder
-
-
-def two_for_one(root: Path) -> Path:
+def two_for_one(folder: Path) -> None:
     """Tails of two names fit the same file: which of them it is, nobody knows."""
-    folder = write_nerfstudio(root, small_views(COUNT))
     for number, side in ((0, "left"), (1, "right")):
         edit_frame(folder / JSON, number, file_path=f"{side}/r_0.png")
     (folder / "images/r_0.png").rename(folder / "r_0.png")
-    return folder
 
 
-def without_images(root: Path) -> Path:
-    folder = write_colmap(root, small_views(COUNT))
-    (folder / "sparse/0/points3D.txt").touch()
-    (folder / "sparse/0/images.txt").unlink()
-    return folder
+def splat(folder: Path) -> None:
+    (folder / "point_cloud/iteration_7000").mkdir(parents=True)
+    (folder / "cameras.json").write_text(json.dumps([{"id": 0, "img_name": "a", "width": 8, "height": 6}]))
 
 
-def splat(root: Path) -> Path:
-    (root / "point_cloud/iteration_7000").mkdir(parents=True)
-    (root / "cameras.json").write_text(json.dumps([{"id": 0, "img_name": "a", "width": 8, "height": 6}]))
-    return root
-
-
-def with_entities(root: Path) -> Path:
-    file = write_metashape(root, small_views(COUNT)) / "cameras.xml"
-    file.write_text(file.read_text().replace("?>", '?><!DOCTYPE d [<!ENTITY a "aaaa">]>'))
-    return root
-
-
-def fewer_poses(root: Path) -> Path:
-    folder = write_llff(root, small_views(COUNT))
-    np.save(folder / "poses_bounds.npy", np.load(folder / "poses_bounds.npy")[1:])
-    return folder
-
-
-def unknown_lens(root: Path) -> Path:
-    file = write_opensfm(root, small_views(COUNT)) / "reconstruction.json"
-    file.write_text(file.read_text().replace('"brown"', '"dual"'))
-    return root
-
-
-REFUSED: dict[str, tuple[Write, tuple[str, ...]]] = {
-    "turned after SfM": (turned, ("image is 12x16", "not turned by a quarter")),
-    "a pose far away": (far, ("r_2 is at 1e+30", "below 1e+10")),
-    "one file for two names": (two_for_one, ("frame 1", "different images")),
-    "a model without images": (without_images, ("sparse/0", "no cameras and images")),
-    "output of a splat": (splat, ("output of 3D Gaussian Splatting", "bidnerf import")),
-    "entities in XML": (with_entities, ("cameras.xml", "document type")),
-    "LLFF with fewer poses": (fewer_poses, ("has 3 poses for 4 images", "one for each")),
-    "OpenSfM with an unknown lens": (unknown_lens, ("projection_type is dual", "perspective")),
+REFUSED: dict[str, tuple[Write, Edit, tuple[str, ...]]] = {
+    # What writes the capture, what then happens to its folder, and parts of the message.
+    "turned after SfM": (
+        write_nerfstudio,
+        lambda folder: [
+            write_image(folder / "images" / f"{view.frame.name}.png", np.rot90(pixels(view)).copy())
+            for view in small_views(COUNT)
+        ],
+        ("image is 12x16", "not turned by a quarter"),
+    ),
+    "a pose far away": (
+        write_nerfstudio,
+        lambda folder: edit_frame(
+            folder / JSON, 2, transform_matrix=[[1, 0, 0, 1e30], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+        ),
+        ("r_2 is at 1e+30", "below 1e+10"),
+    ),
+    "one file for two names": (write_nerfstudio, two_for_one, ("frame 1", "different images")),
+    "a model without images": (
+        write_colmap,
+        lambda folder: [(folder / "sparse/0/points3D.txt").touch(), (folder / "sparse/0/images.txt").unlink()],
+        ("sparse/0", "no cameras and images"),
+    ),
+    "output of a splat": (lambda root, _: root, splat, ("output of 3D Gaussian Splatting", "bidnerf import")),
+    "entities in XML": (
+        write_metashape,
+        lambda folder: edit_text(folder / "cameras.xml", "?>", '?><!DOCTYPE d [<!ENTITY a "aaaa">]>'),
+        ("cameras.xml", "document type"),
+    ),
+    "LLFF with fewer poses": (
+        write_llff,
+        lambda folder: np.save(folder / "poses_bounds.npy", np.load(folder / "poses_bounds.npy")[1:]),
+        ("has 3 poses for 4 images", "one for each"),
+    ),
+    "OpenSfM with an unknown lens": (
+        write_opensfm,
+        lambda folder: edit_text(folder / "reconstruction.json", '"brown"', '"dual"'),
+        ("projection_type is dual", "perspective"),
+    ),
 }
 
 
 @pytest.mark.parametrize("kind", REFUSED)
 def test_what_would_be_read_wrongly_is_refused(kind: str, tmp_path: Path) -> None:
-    write, expected = REFUSED[kind]
-    text = message(write(tmp_path))
+    write, edit, expected = REFUSED[kind]
+    folder = write(tmp_path, small_views(COUNT))
+    edit(folder)
+    text = message(folder)
     assert all(part in text for part in expected), text
 
 

@@ -14,7 +14,7 @@ import torch
 
 # Inside: how often the frames of a split are named
 import bidnerf_core.datasets.capture as capture_module
-from bidnerf_core.datasets import Capture, open_dataset
+from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputWarning
 from bidnerf_core.frames import Frame
 from refusals import refused
@@ -27,10 +27,6 @@ JSON = "transforms.json"
 def random_pixels(number: int, channels: int) -> np.ndarray:
     image = np.random.default_rng(number).integers(0, 256, (H, W, channels), dtype=np.uint8)
     return image[..., 0] if channels == 1 else image
-
-
-def from_zero_to_one(image: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(image.astype(np.float32)) / 255
 
 
 @pytest.fixture
@@ -106,7 +102,7 @@ def test_colours_are_laid_over_the_background_where_there_is_alpha(
     with pytest.warns(InputWarning, match="1 of 6 images is missing"):
         dataset = open_dataset(blender, given)
     frame = dataset.views("train", ["r_1"])[0].frame
-    raw = from_zero_to_one(random_pixels(1, 4))
+    raw = torch.from_numpy(random_pixels(1, 4).astype(np.float32)) / 255
     assert dataset.background == expected
     torch.testing.assert_close(frame.alpha, raw[..., 3])
     over = raw[..., :3] * raw[..., 3:] + torch.tensor(expected) * (1 - raw[..., 3:])
@@ -193,7 +189,6 @@ def test_splits_of_several_files(blender: Path) -> None:
     """They come before the single file."""
     (blender / JSON).write_text("{}")
     dataset = open_dataset(blender)
-    assert isinstance(dataset, Capture)
     assert dataset.splits == ("train", "val", "test")
     assert dataset.frame_names("train") == ["r_0", "r_1", "r_2"]
     (blender / "transforms_train.json").unlink()

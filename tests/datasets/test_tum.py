@@ -148,15 +148,20 @@ TRAJECTORIES: dict[str, tuple[str, Callable[[float, SE3], str]]] = {
 }
 
 
-def test_nanoseconds_may_have_a_fraction(tmp_path: Path) -> None:
-    (tmp_path / "path.txt").write_text("1403636579763555584.0 0 0 0 0 0 0 1\n")
-    assert read_trajectory(tmp_path / "path.txt").times.tolist() == pytest.approx([1403636579.7635556])
-
-
-def test_nanoseconds_that_the_header_states_may_be_of_any_size(tmp_path: Path) -> None:
-    (tmp_path / "path.csv").write_text("#timestamp [ns]\n863636579763555,0,0,0,1,0,0,0\n")  # a device up for ten days
-    found = read_trajectory(tmp_path / "path.csv")
-    assert found.times.tolist() == pytest.approx([863636.579763555])
+@pytest.mark.parametrize(
+    ("name", "content", "seconds"),
+    [
+        ("path.txt", "1403636579763555584.0 0 0 0 0 0 0 1\n", 1403636579.7635556),
+        # Of any size where the header states the unit: a device that has been up for ten days.
+        ("path.csv", "#timestamp [ns]\n863636579763555,0,0,0,1,0,0,0\n", 863636.579763555),
+    ],
+)
+def test_nanoseconds_may_have_a_fraction_and_are_stated_by_a_header(
+    name: str, content: str, seconds: float, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_text(content)
+    found = read_trajectory(tmp_path / name)
+    assert found.times.tolist() == pytest.approx([seconds])
     assert torch.equal(found.rotations[0], torch.eye(3, dtype=torch.float64))
 
 

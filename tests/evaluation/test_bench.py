@@ -121,16 +121,11 @@ def test_closed_form_data_are_a_dataset(name: str) -> None:
 # Resuming.
 
 
-def _written(path: Path, *seeds: int) -> list[TrialResult]:
-    results = [ran(seed) for seed in seeds]
-    ResultTable(tuple(results)).save(path)
-    return results
-
-
 @pytest.mark.parametrize("kept", [0.01, 0.5, 0.999, 1.0])
 def test_a_half_written_last_line_is_dropped_and_nothing_else(tmp_path: Path, kept: float) -> None:
     path = tmp_path / "r.jsonl"
-    first, second = _written(path, 0, 1)
+    first, second = ran(0), ran(1)
+    ResultTable((first, second)).save(path)
     whole, half = path.read_bytes(), as_line(second.plain())[:-1]
     path.write_bytes(as_line(first.plain()) + half[: math.ceil(kept * len(half))])
     known = [first, second] if kept == 1 else [first]  # the line of 1 lacks only its end

@@ -12,6 +12,7 @@ import warnings
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import Mock
 
 import imageio.v3 as iio
 import pytest
@@ -205,10 +206,7 @@ def test_an_interrupted_report_is_written_again(
     tmp_path: Path, results: list[TrialResult], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file, out = write(tmp_path / "r.jsonl", *results), tmp_path / "out"
-
-    def interrupt(self: Figures) -> Path:
-        raise KeyboardInterrupt
-
+    interrupt = Mock(side_effect=KeyboardInterrupt)
     with monkeypatch.context() as patch:
         patch.setattr(Figures, "convergence", interrupt)
         assert main(["report", str(file), "--out", str(out)]) == 130

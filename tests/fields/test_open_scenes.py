@@ -6,14 +6,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
 
 import tiny
 from bidnerf.testing import SCENE_BOUNDS as BOUNDS
 from bidnerf.testing import check_intervals, check_repeatable, rgb_views
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.fields import RadianceField, Rays, VoxelGrid, levels, render
-from bidnerf_core.frames import View
 from bidnerf_core.training import Silent
 from bidnerf_hashgrid import backend as hashgrid
 from bidnerf_hashgrid.occupancy import OccupancyGrid
@@ -63,16 +61,11 @@ def test_values_far_away_are_finite_and_have_derivatives(name: str) -> None:
     assert bool(require(away.grad).isfinite().all())
 
 
-def occupied_in(grid: OccupancyGrid, share: float = 0.3) -> Tensor:
-    cells = torch.rand(grid.grid.shape, generator=torch.Generator().manual_seed(8)) < share
+def test_an_occupancy_grid_of_contracted_space_samples_its_occupied_cells_only() -> None:
+    grid, rays = OccupancyGrid(OPEN, 16), outward()
+    cells = torch.rand(grid.grid.shape, generator=torch.Generator().manual_seed(8)) < 0.3
     grid.peak.copy_(cells)
     grid.prune(0.5, grow=False)
-    return cells
-
-
-def test_an_occupancy_grid_of_contracted_space_samples_its_occupied_cells_only() -> None:
-    grid = OccupancyGrid(OPEN, 16)
-    cells, rays = occupied_in(grid), outward()
     samples = grid(rays)
     at = rays.at(samples.middles)
     # Within an interval the coordinate is not linear: its middle may lie in the cell beside that of the coordinate's.
@@ -110,7 +103,9 @@ def test_training_learns_what_lies_beyond_the_box() -> None:
     Where space ends at the box, no step can change what they see.
     """
     config = tiny.config(samples_per_step=4096, carve=False)
-    corners = torch.stack([_corner(view) for view in rgb_views()])
+    pixel = torch.tensor([0.5, 0.5], dtype=torch.float64)
+    rays = [view.T_ref_camera.rotate(view.frame.intrinsics.unproject(pixel)) for view in rgb_views()]
+    corners = torch.nn.functional.normalize(torch.stack(rays), dim=-1).float()
     places = torch.stack([view.T_ref_camera.translation for view in rgb_views()]).float()
     seen = []
     for bounds, steps in ((OPEN, 150), (replace(OPEN, contracted=False), 8)):
@@ -120,9 +115,3 @@ def test_training_learns_what_lies_beyond_the_box() -> None:
             seen.append(render(field, bounds.rays(places, corners), torch.zeros(3)).rgb)
     assert float(seen[0].min()) > 0.75
     assert float(seen[1].max()) == 0
-
-
-def _corner(view: View) -> Tensor:
-    """Return the direction of a view's first pixel (world)."""
-    ray = view.frame.intrinsics.unproject(torch.tensor([[0.5, 0.5]], dtype=torch.float64))
-    return torch.nn.functional.normalize(view.T_ref_camera.rotate(ray)[0], dim=-1).float()

@@ -12,18 +12,12 @@ from bidnerf_bid.residuals import colour_term, depth_term
 from bidnerf_core.fields import Observations, SceneBounds, render, widen
 from bidnerf_core.frames import View, draw, uniform
 from bidnerf_core.geometry import SE3, Robust, perturb
-from bidnerf_core.localization import Problem, rig
+from bidnerf_core.localization import rig
 from blob_images import BOUNDS, photograph
 from problems import FieldMap, localize, single
 
 HUBER = Robust("huber", 0.1)
 PAPERS = Objective((colour_term(HUBER), depth_term(HUBER, 1.0)))
-
-
-def loss(problem: Problem, T_world_last: SE3, wide: float = 1.0) -> torch.Tensor:
-    pixels = draw(problem.views, 60, uniform, torch.Generator().manual_seed(7), torch.float64)
-    rays = widen(pixels.rays(T_world_last, problem.bounds), wide)
-    return PAPERS.loss(render(problem.field, rays, problem.bounds.background), pixels)
 
 
 @pytest.mark.parametrize("views", [1, 3])
@@ -33,17 +27,19 @@ def test_gradient_by_the_pose_is_the_numerical_one(views: int, wide: float) -> N
     poses = orbit(4.0, views + 3, seed=1)[:views]
     seen = [View(photograph(T, field=field), T) for T in poses]
     problem = rig(FieldMap(field, BOUNDS), seen, perturb(poses[-1], 0.3, 8.0, seed=0))
+    pixels = draw(problem.views, 60, uniform, torch.Generator().manual_seed(7), torch.float64)
 
     def by_tangent(xi: torch.Tensor) -> torch.Tensor:
         # The interval on each ray says the part that is sampled, without a derivative: hold it, as autograd does.
-        pixels = draw(problem.views, 60, uniform, torch.Generator().manual_seed(7), torch.float64)
         here = widen(pixels.rays(problem.start, problem.bounds), wide)
         moved = pixels.rays(problem.start.retract(xi), problem.bounds)
         rays = type(here)(moved.origins, moved.directions, here.near, here.far)
         return PAPERS.loss(render(field, rays, BOUNDS.background), pixels)
 
     zero = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    (found,) = torch.autograd.grad(loss(problem, problem.start.retract(zero), wide), zero)
+    rays = widen(pixels.rays(problem.start.retract(zero), problem.bounds), wide)
+    loss = PAPERS.loss(render(problem.field, rays, problem.bounds.background), pixels)
+    (found,) = torch.autograd.grad(loss, zero)
     numerical = []
     for k in range(6):
         step = torch.zeros(6, dtype=torch.float64)

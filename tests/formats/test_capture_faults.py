@@ -95,10 +95,6 @@ def depth_array(file: Path) -> None:
     frame(0, depth_file_path="depth/r_0.npy")(file)
 
 
-def of_floats(file: Path) -> None:
-    Image.fromarray(np.zeros((12, 16), np.float32)).save(file, "TIFF")
-
-
 def fisheye(file: Path) -> None:
     replaced("radial-tangential", "equidistant")(file)
     replaced("[0.0, 0.0, 0.0, 0.0]", "[0.1, 0.0, 0.0, 0.0]")(file)
@@ -235,7 +231,11 @@ FAULTS: dict[str, list[tuple[str, Edit, str | tuple[str, ...]]]] = {
             ("images/r_2.png", "16x13", "16x12"),
         ),
         ("images/r_2.png", image((500, 400, 3), np.uint8, cut=True), ("400x500", "16x12")),  # is not decoded
-        ("images/r_0.png", of_floats, ("float32", "RGB")),
+        (
+            "images/r_0.png",
+            lambda file: Image.fromarray(np.zeros((12, 16), np.float32)).save(file, "TIFF"),
+            ("float32", "RGB"),
+        ),
         ("depth/r_0.png", image((12, 16, 3), np.uint8), ("12x16x3", "one channel")),
         ("depth/r_0.png", image((12, 8)), ("depth is 8x12", "16x12")),
         (JSON, depth_array, ("r_0.npy", "not readable as an array")),

@@ -8,6 +8,7 @@ import logging
 import pickle
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -119,9 +120,7 @@ def test_a_store_returns_what_is_put_into_it(expected: int, tmp_path: Path, monk
 
 
 def test_a_full_disk_is_an_error_in_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
+    full = Mock(side_effect=OSError(28, "No space left on device"))
     monkeypatch.setattr(storage.os, "posix_fallocate", full)
     with pytest.raises(InputError, match=rf"^{tmp_path}: no room for 5000 MB of images \(No space left on device\)"):
         PixelStore(5_000_000_000, tmp_path).store(byte_frame())

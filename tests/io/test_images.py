@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -171,13 +172,9 @@ def test_the_first_bytes_count_not_the_name(tmp_path: Path) -> None:
 def test_permission_that_is_denied_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.png"
     Image.fromarray(noise(3, 4)).save(path)
-
-    def refuse(*_: object) -> None:
-        raise PermissionError(13, "Permission denied")
-
     path.chmod(0)
     if os.access(path, os.R_OK):  # nothing is denied to root
-        monkeypatch.setattr(files.Path, "open", refuse)
+        monkeypatch.setattr(files.Path, "open", Mock(side_effect=PermissionError(13, "Permission denied")))
     with refused(where=path, found="permission denied", expected="a readable file: an image file"):
         read_image(path)
 

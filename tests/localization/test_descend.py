@@ -51,10 +51,14 @@ def starts(count: int, spread: float = 0.2) -> States:
 
 @pytest.mark.parametrize("pivot", [None, torch.tensor([0.3, -0.2, 4.0], dtype=torch.float64)])
 def test_it_finds_what_scipy_finds(pivot: Tensor | None) -> None:
-    def flat(xi: Tensor) -> Tensor:
-        return residuals(SE3.exp(torch.as_tensor(xi, dtype=torch.float64))).flatten().numpy()
-
-    oracle = least_squares(flat, XI_TRUE.numpy(), method="lm", xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    oracle = least_squares(
+        lambda xi: residuals(SE3.exp(torch.as_tensor(xi, dtype=torch.float64))).flatten().numpy(),
+        XI_TRUE.numpy(),
+        method="lm",
+        xtol=1e-14,
+        ftol=1e-14,
+        gtol=1e-14,
+    )
     path: list[tuple[SE3, Tensor]] = []
     found, normal = descend(starts(8), [reprojection], 30, pivot, path)
     expected = SE3.exp(torch.as_tensor(oracle.x)).matrix().expand(8, 4, 4)

@@ -116,16 +116,19 @@ def test_lenses_that_no_correction_describes_are_not_compared(focal: float, k: t
 
 
 @pytest.mark.parametrize(
-    "stated", [PINHOLE, PINHOLE.resized(200, 150), PINHOLE.resized(800, 600)], ids=["same", "half", "twice"]
+    ("stated", "of_map"),
+    [
+        (PINHOLE, [PINHOLE]),
+        (PINHOLE.resized(200, 150), [PINHOLE]),
+        (PINHOLE.resized(800, 600), [PINHOLE]),
+        (scaled(1.05), [*(scaled(1 + 0.001 * i) for i in range(20)), scaled(1.05)]),
+    ],
+    ids=["same", "half", "twice", "of one of its images"],
 )
-def test_an_image_of_the_maps_camera_of_any_size_needs_no_correction(stated: Intrinsics) -> None:
-    (found,) = cameras_of_map(query(stated), landmarks(PINHOLE))
-    assert float(found.abs().max()) < 1e-9
-
-
-def test_the_camera_of_any_image_of_the_map_needs_no_correction() -> None:
-    usual, other = [scaled(1 + 0.001 * i) for i in range(20)], scaled(1.05)
-    (found,) = cameras_of_map(query(other), landmarks(*usual, other))
+def test_an_image_of_a_camera_of_the_map_of_any_size_needs_no_correction(
+    stated: Intrinsics, of_map: list[Intrinsics]
+) -> None:
+    (found,) = cameras_of_map(query(stated), landmarks(*of_map))
     assert float(found.abs().max()) < 1e-9
 
 

@@ -16,7 +16,6 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.localization import LandmarkMatcher
 from bidnerf_core.mapping import (
     LandmarkMap,
-    SurfaceMap,
     build_landmarks,
     concatenate,
     landmark_tensors,
@@ -35,12 +34,6 @@ def landmarks() -> LandmarkMap:
     return build_landmarks(ring(points), points)
 
 
-def odd_surface() -> SurfaceMap:
-    """Return a surface whose corner is no round number."""
-    grid = replace(baked.toy().grid, lower=(0.1, 1 / 3, -1e-7), cell=1 / 7)
-    return replace(baked.toy(), index=replace(baked.toy().index, grid=grid))
-
-
 KINDS: dict[str, tuple[Callable[[Any], dict[str, Tensor]], Callable[[Mapping[str, Tensor]], Any]]] = {
     "landmarks": (landmark_tensors, landmarks_from_tensors),
     "surface": (surface_tensors, surface_from_tensors),
@@ -53,7 +46,13 @@ KINDS: dict[str, tuple[Callable[[Any], dict[str, Tensor]], Callable[[Mapping[str
         ("landmarks", landmarks),
         ("landmarks", lambda: landmarks()[torch.tensor([], dtype=torch.long)]),
         ("surface", baked.toy),
-        ("surface", odd_surface),
+        (
+            "surface",  # whose corner is no round number
+            lambda: replace(
+                baked.toy(),
+                index=replace(baked.toy().index, grid=replace(baked.toy().grid, lower=(0.1, 1 / 3, -1e-7), cell=1 / 7)),
+            ),
+        ),
     ],
 )
 def test_there_and_back(kind: str, make: Callable[[], Any]) -> None:

@@ -120,6 +120,8 @@ def test_backends_are_imported_where_tensors_have_values(tmp_path: Path, monkeyp
 def test_what_is_saved_is_what_is_loaded(complete: bool, tmp_path: Path) -> None:
     saved = write_parts(tmp_path / "a" / "map", info(complete=complete), state())
     assert replace(saved, weights="", training=None) == info(complete=complete)
+    suffixes = {file.suffix for file in (tmp_path / "a" / "map").iterdir()}
+    assert suffixes == {".json", ".safetensors"}, "nothing on disk can run"
     loaded = load_map(tmp_path / "a" / "map")
     assert loaded.info == saved
     assert loaded.bounds == BOUNDS
@@ -174,11 +176,6 @@ def test_views_of_shared_or_strided_memory_are_saved(tmp_path: Path) -> None:
     tensors["geometry.0.weight"] = weight.t().contiguous().t()
     write_parts(tmp_path, info(), TrainingState(5, tensors, {}))
     assert_holds(load_map(tmp_path), state())
-
-
-def test_nothing_on_disk_can_run(tmp_path: Path) -> None:
-    write_parts(tmp_path, info(), state())
-    assert {file.suffix for file in tmp_path.iterdir()} == {".json", ".safetensors"}
 
 
 def test_old_files_are_removed_and_others_are_left_alone(tmp_path: Path) -> None:

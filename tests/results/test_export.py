@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,6 +30,13 @@ def scene() -> Map:
     cameras = tuple(replace(camera, file=f"images/{camera.name}.JPG") for camera in stored_cameras(training_views()))
     info = MapInfo("ground", {}, BOUNDS, 1, True, "ground", weights="w", cameras=cameras, unit="metres")
     return Map(info, known.field, known.surface, known.landmarks)
+
+
+def exported_to_colmap(scene: Map, folder: Path) -> Any:
+    """Return COLMAP's reconstruction of the model that is exported into a folder."""
+    pycolmap = pytest.importorskip("pycolmap")
+    bn.export_map(scene, folder, "colmap")
+    return pycolmap.Reconstruction(str(folder))
 
 
 def read_ply(file: Path) -> tuple[list[str], np.ndarray]:
@@ -71,9 +79,7 @@ def test_transforms_json_is_read_again(scene: Map, tmp_path: Path) -> None:
 
 def test_colmap_reads_the_model(scene: Map, tmp_path: Path) -> None:
     """The model has the keypoints that the landmarks were built from, which lie near their projections."""
-    pycolmap = pytest.importorskip("pycolmap")
-    bn.export_map(scene, tmp_path / "out", "colmap")
-    model = pycolmap.Reconstruction(str(tmp_path / "out"))
+    model = exported_to_colmap(scene, tmp_path / "out")
     landmarks = require(scene.landmarks)
     assert len(model.points3D) == len(landmarks)
     np.testing.assert_allclose(model.points3D[1].xyz, landmarks.positions[0], atol=1e-6)
@@ -96,12 +102,10 @@ def test_colmap_reads_the_model(scene: Map, tmp_path: Path) -> None:
 
 
 def test_names_that_would_break_a_row_are_escaped(scene: Map, tmp_path: Path) -> None:
-    pycolmap = pytest.importorskip("pycolmap")
     first, *others = scene.info.cameras
     odd = replace(scene, info=replace(scene.info, cameras=(replace(first, file="a\nb\x1b.jpg"), *others)))
-    bn.export_map(odd, tmp_path / "out", "colmap")
+    model = exported_to_colmap(odd, tmp_path / "out")
     assert b"\x1b" not in (tmp_path / "out" / "images.txt").read_bytes()
-    model = pycolmap.Reconstruction(str(tmp_path / "out"))
     assert len(model.images) == len(scene.info.cameras)
     assert model.images[1].name.endswith("a\\nb\\x1b.jpg")
 
@@ -110,11 +114,9 @@ def test_names_that_would_break_a_row_are_escaped(scene: Map, tmp_path: Path) ->
 def test_photos_that_were_turned_upright_are_exported_as_their_files_store_them(
     scene: Map, code: int, tmp_path: Path
 ) -> None:
-    pycolmap = pytest.importorskip("pycolmap")
     first, *others = scene.info.cameras
     turned = replace(first, orientation=Orientation.from_exif(code))
-    bn.export_map(replace(scene, info=replace(scene.info, cameras=(turned, *others))), tmp_path / "out", "colmap")
-    model = pycolmap.Reconstruction(str(tmp_path / "out"))
+    model = exported_to_colmap(replace(scene, info=replace(scene.info, cameras=(turned, *others))), tmp_path / "out")
     image = model.images[1]
     size = (image.camera.width, image.camera.height)
     assert size == Orientation.from_exif(code).upright_size(first.intrinsics.width, first.intrinsics.height)
@@ -135,11 +137,9 @@ def test_images_of_a_dataset_keep_the_names_of_their_files(tmp_path: Path) -> No
 
 def test_landmarks_without_tracks_are_points_alone(scene: Map, tmp_path: Path) -> None:
     """There are none in maps that earlier versions stored, and in those whose landmarks come from rendered images."""
-    pycolmap = pytest.importorskip("pycolmap")
-    assert scene.landmarks is not None
-    bn.export_map(replace(scene, landmarks=replace(scene.landmarks, tracks=None)), tmp_path / "out", "colmap")
-    model = pycolmap.Reconstruction(str(tmp_path / "out"))
-    assert (len(model.points3D), model.compute_num_observations()) == (len(scene.landmarks), 0)
+    landmarks = require(scene.landmarks)
+    model = exported_to_colmap(replace(scene, landmarks=replace(landmarks, tracks=None)), tmp_path / "out")
+    assert (len(model.points3D), model.compute_num_observations()) == (len(landmarks), 0)
 
 
 def test_what_cannot_be_exported_is_said(scene: Map, tmp_path: Path) -> None:

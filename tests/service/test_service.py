@@ -18,7 +18,7 @@ import tempfile
 import threading
 import time
 from base64 import b64encode
-from collections.abc import AsyncIterator, Awaitable, Iterator
+from collections.abc import Awaitable, Iterator
 from dataclasses import dataclass, field, replace
 from email.utils import formatdate
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -104,11 +104,8 @@ class Service:
     def __init__(self, app: Any, loop: asyncio.AbstractEventLoop, url: str) -> None:
         self.app, self.loop, self.url = app, loop, url
         self.pool: Pool = app.state.pool
+        self.metric = self.pool.metric
         self.description = app.openapi()
-
-    def metric(self, name: str, **labels: str) -> float:
-        """A number that the service tells of itself now."""
-        return self.pool.metric(name, **labels)
 
     def run(self, work: Awaitable[Any]) -> Any:
         async def waited() -> Any:
@@ -165,23 +162,20 @@ class Service:
                 reply.body += message.get("body", b"")
 
         await self.app(scope, receive, send)
-        self._require_described(method, path, reply)
-        return reply
-
-    description: dict[str, Any] | None = None  # of an application that describes itself
-
-    def _require_described(self, method: str, path: str, reply: Reply) -> None:
-        """Every answer of every test has a status, a type and headers that the description promises."""
+        # Every answer of every test has a status, a type and headers that the description promises.
         template = re.sub("^/maps/[^/]+", "/maps/{map}", path)
         operation = (self.description or {"paths": {}})["paths"].get(template, {}).get(method.lower())
         if operation is None or reply.status == 499:  # for which there is nobody to receive it
-            return
+            return reply
         description = operation["responses"][str(reply.status)]
         kinds = {kind.partition(";")[0] for kind in description["content"]}
         assert reply.headers["content-type"].partition(";")[0] in kinds
         usual = {"x-request-id", "content-type", "content-length", "connection", *map(str.lower, SAFE)}
         assert set(reply.headers) - usual == {name.lower() for name in description.get("headers", ())} - usual
         assert reply.headers.keys() >= set(map(str.lower, SAFE))
+        return reply
+
+    description: dict[str, Any] | None = None  # of an application that describes itself
 
 
 @dataclass(frozen=True)
@@ -437,14 +431,9 @@ def test_nothing_is_lost_when_a_worker_is_killed(service: Service, inputs: Input
     assert service.metric("worker_restarts_total", reason="died") == before + 1
 
 
-def holder_of_maps(service: Service) -> psutil.Process:
-    """Return the process from which workers are forked."""
-    return psutil.Process(require(service.pool._maps)[0].pid)
-
-
 @pytest.mark.slow
 def test_nothing_is_lost_when_the_process_with_the_maps_is_killed(service: Service, inputs: Inputs) -> None:
-    maps = holder_of_maps(service)
+    maps = psutil.Process(require(service.pool._maps)[0].pid)  # from which workers are forked
     with pause_worker(service) as process:
         waiting = request(service, inputs)
         wait_until(lambda: service.metric("requests_in_progress") == 1)
@@ -796,7 +785,10 @@ def test_a_request_that_waits_while_the_server_is_stopped_may_be_repeated() -> N
     """It is answered with 503, and reported, once the time that is left to it is over."""
     stop, addresses, reports = threading.Event(), SimpleQueue[str](), list[tuple[str, int]]()
     app = Application(
-        "slow", None, report=lambda scope, status, *_: reports.append((scope["path"], status)), lifespan=unmanaged
+        "slow",
+        None,
+        report=lambda scope, status, *_: reports.append((scope["path"], status)),
+        lifespan=lambda app: contextlib.nullcontext(),
     )
 
     @app.get("/slow")
@@ -812,11 +804,6 @@ def test_a_request_that_waits_while_the_server_is_stopped_may_be_repeated() -> N
     assert (refused.value.status, refused.value.headers["Retry-After"]) == (503, "5")
     assert "is being stopped" in json.load(refused.value)["detail"]
     assert reports == [("/slow", 503)]
-
-
-@contextlib.asynccontextmanager
-async def unmanaged(app: Any) -> AsyncIterator[None]:
-    yield
 
 
 def test_the_listening_process_does_not_load_torch() -> None:

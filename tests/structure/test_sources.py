@@ -54,13 +54,6 @@ def test_signals_go_on_to_their_handlers_after_pycolmap_is_imported() -> None:
     assert (ended.returncode, ended.stderr) == (7, b"")
 
 
-def picture(file: Path, grey16: bool = False, seed: int = 0) -> Path:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    noise = np.random.default_rng(seed).integers(0, 255, (48, 64) if grey16 else (48, 64, 3))
-    Image.fromarray(noise.astype(np.uint16 if grey16 else np.uint8)).save(file)
-    return file
-
-
 @pytest.mark.parametrize(
     ("names", "remark"),
     {
@@ -79,10 +72,12 @@ def picture(file: Path, grey16: bool = False, seed: int = 0) -> Path:
 )
 def test_what_lies_beside_photos_is_no_photo_and_is_named(tmp_path: Path, names: list[str], remark: str | None) -> None:
     for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
         if name.endswith((".jpg", ".png")):
-            picture(tmp_path / name, "measured" in name)
+            shape, kind = ((48, 64), np.uint16) if "measured" in name else ((48, 64, 3), np.uint8)
+            noise = np.random.default_rng(0).integers(0, 255, shape).astype(kind)
+            Image.fromarray(noise).save(tmp_path / name)
         else:
-            (tmp_path / name).parent.mkdir(exist_ok=True)
             (tmp_path / name).write_text('<rdf xcr:Position="1 2 3"/>')
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

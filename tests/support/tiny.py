@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from bidnerf.scenes import demo_object, orbit
@@ -81,7 +80,10 @@ def write_dataset(folder: Path, train: int = 6, test: int = 3, depth: bool = Tru
     for split, letter, view in seen:
         name = f"images/{letter}_{view.frame.name}.png"
         frame: dict[str, Any] = {"file_path": name, "transform_matrix": opengl(view).tolist()}
-        write_image(folder / name, _rgba(view))
+        cover = require(view.frame.alpha)[..., None]
+        colour = (view.frame.rgb - (1 - cover) * torch.tensor(BACKGROUND)) / cover.clamp(min=1e-3)
+        rgba = torch.cat([colour.clamp(0, 1), cover], dim=-1)
+        write_image(folder / name, (rgba * 255).round().to(torch.uint8).numpy())
         if depth:
             frame["depth_file_path"] = f"depth/{letter}_{view.frame.name}.png"
             write_image(folder / frame["depth_file_path"], millimetres(view))
@@ -90,13 +92,6 @@ def write_dataset(folder: Path, train: int = 6, test: int = 3, depth: bool = Tru
     camera = {"fl_x": CAMERA.fx, "fl_y": CAMERA.fy, "cx": CAMERA.cx, "cy": CAMERA.cy, "w": SIZE, "h": SIZE}
     (folder / "transforms.json").write_text(json.dumps(camera | {"frames": frames} | listed))
     return folder
-
-
-def _rgba(view: View) -> np.ndarray:
-    alpha = require(view.frame.alpha)
-    cover = alpha[..., None]
-    colour = (view.frame.rgb - (1 - cover) * torch.tensor(BACKGROUND)) / cover.clamp(min=1e-3)
-    return (torch.cat([colour.clamp(0, 1), cover], dim=-1) * 255).round().to(torch.uint8).numpy()
 
 
 def depth_rays_of(views: Sequence[View]) -> Observations:

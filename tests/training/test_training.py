@@ -155,11 +155,9 @@ def test_a_parameter_without_a_gradient_yet_is_resumed_too() -> None:
     def train(report: Report) -> dict[str, Tensor]:
         torch.manual_seed(0)
         pair = nn.ModuleList([nn.Linear(1, 1), nn.Linear(1, 1)])
-
-        def outcome(step: int, generator: Generator) -> StepOutcome:
-            return line_outcome(pair[0 if step < 6 else 1])(step, generator)
-
-        fit(pair, [{"params": pair.parameters(), "lr": 0.1}], outcome, 12, report)
+        first, second = map(line_outcome, pair)
+        groups = [{"params": pair.parameters(), "lr": 0.1}]
+        fit(pair, groups, lambda step, *more: (first if step < 6 else second)(step, *more), 12, report)
         return pair.state_dict()
 
     half = Recorder(stop=3)
@@ -171,12 +169,14 @@ def test_a_parameter_without_a_gradient_yet_is_resumed_too() -> None:
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_a_loss_that_is_not_finite_ends_the_training_before_it_spreads(bad: float) -> None:
     line, report = nn.Linear(1, 1), Recorder()
-
-    def outcome(step: int, generator: Generator) -> StepOutcome:
-        return StepOutcome(line.weight.sum() * (bad if step == 2 else 1.0), 0.0)
-
     with refused(found="training diverged") as caught:
-        fit(line, [{"params": line.parameters(), "lr": 0.1}], outcome, 5, report)
+        fit(
+            line,
+            [{"params": line.parameters(), "lr": 0.1}],
+            lambda step, _: StepOutcome(line.weight.sum() * (bad if step == 2 else 1.0), 0.0),
+            5,
+            report,
+        )
     assert re.search(rf"loss -?{bad} at step 3", caught.error.found)
     assert bool(line.weight.isfinite().all())
     assert [progress.step for progress in report.steps] == [1, 2]
