@@ -63,17 +63,6 @@ def lost_pose(root: Path) -> None:
     unlinked("rgbd/1.jpg", "rgbd/2.depth")(root)
 
 
-def lost_tracking(root: Path) -> None:
-    (root / "data/frame-000002.pose.txt").write_text("-inf -inf -inf -inf\n" * 4)
-
-
-def zero_pose(root: Path) -> None:
-    edit_rows(
-        root / "groundtruth.txt",
-        lambda r: [r[0].replace(" ", " nan ", 1), f"{r[1].split()[0]} 1 2 3 0 0 0 0", *r[2:]],
-    )
-
-
 def copied_in_part(root: Path) -> None:
     """Four of six images are there, three of their depth images, and the last row of the ground truth is cut off."""
     for kind, kept in (("rgb", 4), ("depth", 3)):
@@ -136,7 +125,10 @@ INCOMPLETE: dict[str, tuple[Callable[[Path], object], int, list[int], list[int],
     ),
     "polycam, not corrected": (unlinked(), 6, [], [], ["no corrected_cameras, so the poses are ARKit's, which drift"]),
     "tum": (
-        zero_pose,
+        lambda root: edit_rows(
+            root / "groundtruth.txt",
+            lambda r: [r[0].replace(" ", " nan ", 1), f"{r[1].split()[0]} 1 2 3 0 0 0 0", *r[2:]],
+        ),
         6,
         [0],
         [],
@@ -154,7 +146,13 @@ INCOMPLETE: dict[str, tuple[Callable[[Path], object], int, list[int], list[int],
             "1 of 6 images have no pose and are left out",
         ],
     ),
-    "twelve-scenes": (lost_tracking, 6, [2], [], ["1 of 6 images have no pose and are left out"]),
+    "twelve-scenes": (
+        lambda root: (root / "data/frame-000002.pose.txt").write_text("-inf -inf -inf -inf\n" * 4),
+        6,
+        [2],
+        [],
+        ["1 of 6 images have no pose and are left out"],
+    ),
     "reality-capture": (
         unlinked("2.png"),
         5,

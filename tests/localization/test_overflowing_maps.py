@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
 
 from bidnerf.testing import textured_map
 from bidnerf_core.errors import InputError
@@ -16,18 +15,14 @@ from flights import flight
 from optional import require
 
 
-def overflowing(tensors: dict[str, Tensor], part: str, value: float) -> dict[str, Tensor]:
-    assert part in tensors
-    return tensors | {part: torch.full_like(tensors[part], value)}
-
-
 @pytest.mark.parametrize("value", [1e30, -1e30, 3.4e38])
 @pytest.mark.parametrize("part", ["rgb", "normals", "positions"])
 def test_a_surface_of_overflowing_numbers_ends_no_tracking(part: str, value: float) -> None:
     known = textured_map(surface=True)
+    tensors = surface_tensors(require(known.surface))
     try:
-        tensors = overflowing(surface_tensors(require(known.surface)), part, value)
-        scene = replace(known, surface=surface_from_tensors(tensors))
+        overflowing = tensors | {part: torch.full_like(tensors[part], value)}
+        scene = replace(known, surface=surface_from_tensors(overflowing))
     except (InputError, ValueError):
         return
     tracker = Tracker(Localizer(scene, warm_up=False))

@@ -6,7 +6,6 @@ import math
 
 import pytest
 import torch
-from torch import Tensor
 
 import baked
 from bidnerf.results import pose_error
@@ -61,10 +60,7 @@ def test_a_rival_is_kept_where_all_others_are_the_same_answer() -> None:
 
 
 def test_a_stage_may_compare_poses_by_another_score() -> None:
-    def score(states: States) -> Tensor:
-        return (states.T.translation[:, 0] - 5).abs()
-
-    found = halve(STARTS, [Stage([two_valleys], 10, 1, score)], MIDDLE)
+    found = halve(STARTS, [Stage([two_valleys], 10, 1, lambda states: (states.T.translation[:, 0] - 5).abs())], MIDDLE)
     assert float(found.states.T.translation[0, 0]) == pytest.approx(5.0, abs=1e-2)
 
 

@@ -43,10 +43,10 @@ Saver: TypeAlias = tuple[Callable[[Path, int], object], Callable[[Path], object]
 
 
 def file(name: str, save: Callable[[Path, int], object], read: Callable[[Path], object] = Path.read_bytes) -> Saver:
-    def content(folder: Path) -> object:
-        return read(folder / name) if (folder / name).exists() else None
-
-    return lambda folder, number: save(folder / name, number), content
+    return (
+        lambda folder, number: save(folder / name, number),
+        lambda folder: read(folder / name) if (folder / name).exists() else None,
+    )
 
 
 def part_of_a_map(name: str) -> Saver:
@@ -75,10 +75,6 @@ def whole_map(complete: bool) -> Saver:
     return save, read
 
 
-def posed(path: Path, number: int) -> None:
-    bn.write_poses(path, [PosedImage(f"{n}", n, CAMERA, POSE) for n in range(number)])
-
-
 def answers(path: Path, number: int) -> None:
     given = Answers()
     for n in range(number):
@@ -86,22 +82,29 @@ def answers(path: Path, number: int) -> None:
     given.write(path)
 
 
-def results(path: Path, number: int) -> None:
-    trials = [Trial("m", "d", ("a",), seed=n) for n in range(number)]
-    ResultTable(tuple(trial_result(trial, [1.0]) for trial in trials)).save(path)
-
-
 SAVERS: dict[str, Saver] = {
     "map": whole_map(complete=True),
     "checkpoint": whole_map(complete=False),
     **{name: part_of_a_map(name) for name in PARTS},
     "bytes": file("x", lambda path, n: write_file(path, bytes(n))),
-    **{f"poses{ending}": file(f"poses{ending}", posed) for ending in POSE_WRITERS if "scanner" not in ending},
+    **{
+        f"poses{ending}": file(
+            f"poses{ending}",
+            lambda path, number: bn.write_poses(path, [PosedImage(f"{n}", n, CAMERA, POSE) for n in range(number)]),
+        )
+        for ending in POSE_WRITERS
+        if "scanner" not in ending
+    },
     "localization": file(
         "found.json", lambda path, n: bn.Localization.save(FOUND.rejected(FOUND) if n > 1 else FOUND, path)
     ),
     "answers": file("found.json", answers),
-    "results": file("r.jsonl", results),
+    "results": file(
+        "r.jsonl",
+        lambda path, number: ResultTable(
+            tuple(trial_result(Trial("m", "d", ("a",), seed=n), [1.0]) for n in range(number))
+        ).save(path),
+    ),
     "comparison": file("c.json", lambda path, n: Comparison("d", "test", "none", (), "auto", {}, 0, n, ()).save(path)),
     "runs": (
         lambda folder, n: note_run(folder / "r.jsonl", provenance("bidnerf evaluate", f"{n}")),

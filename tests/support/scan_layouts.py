@@ -122,10 +122,6 @@ def packed(folder: Path, files: dict[str, bytes], compression: int = zipfile.ZIP
     return folder / "scan.r3d"
 
 
-def write_record3d(folder: Path, views: Sequence[View]) -> Path:
-    return packed(folder, record3d_files(views))
-
-
 def write_unpacked_record3d(folder: Path, views: Sequence[View]) -> Path:
     for name, content in record3d_files(views).items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -544,7 +540,9 @@ class Layout(NamedTuple):
 
 
 LAYOUTS = {
-    "record3d": Layout("record3d", write_record3d, times=True, lossless=False),
+    "record3d": Layout(
+        "record3d", lambda folder, views: packed(folder, record3d_files(views)), times=True, lossless=False
+    ),
     "record3d, unpacked": Layout("record3d", write_unpacked_record3d, times=True, lossless=False),
     "record3d, EXR": Layout("record3d", write_record3d_of_exr, depth=False, times=True, lossless=False),
     "polycam": Layout("polycam", write_polycam, times=True, lossless=False),

@@ -39,9 +39,12 @@ def write_recording(folder: Path, frames: Sequence[Recorded]) -> Path:
         if frame.view.frame.depth is not None:
             steps = (frame.view.frame.depth.double().numpy() * 5000).round().astype(np.uint16)
             rows["depth"].append(_write(folder, "depth", frame.time + 0.004, steps))
-        turn, shift = generator.normal(size=(2, 3))
+        T, (turn, shift) = frame.view.T_ref_camera, generator.normal(size=(2, 3))
         for after in (-0.003, 0.006):
-            rows["groundtruth"].append(_pose_row(frame, turn * after, shift * after, after))
+            rotation = Rotation.from_matrix(T.rotation.numpy()) * Rotation.from_rotvec(turn * after)
+            numbers = [*(T.translation.numpy() + shift * after), *rotation.as_quat()]
+            row = " ".join([f"{frame.time + after:.6f}", *(f"{number:.12f}" for number in numbers)])
+            rows["groundtruth"].append(f"{row}\n")
     for name, columns in {
         "rgb": "filename",
         "depth": "filename",
@@ -55,13 +58,6 @@ def _write(folder: Path, kind: str, time: float, pixels: np.ndarray) -> str:
     name = f"{kind}/{time:.6f}.png"
     iio.imwrite(folder / name, pixels)
     return f"{time:.6f} {name}\n"
-
-
-def _pose_row(frame: Recorded, turn: np.ndarray, shift: np.ndarray, after: float) -> str:
-    T = frame.view.T_ref_camera
-    rotation = Rotation.from_matrix(T.rotation.numpy()) * Rotation.from_rotvec(turn)
-    numbers = [*(T.translation.numpy() + shift), *rotation.as_quat()]
-    return " ".join([f"{frame.time + after:.6f}", *(f"{number:.12f}" for number in numbers)]) + "\n"
 
 
 def edit_rows(file: Path, change: Callable[[list[str]], list[str]]) -> None:
