@@ -47,7 +47,7 @@ from harness import (
     sound_folder,
 )
 
-VARIES = ("seconds", "peak_memory_bytes")
+VARIES = ("seconds", "cpu_seconds", "peak_memory_bytes")
 STEPS, TRIALS, FRAMES = 12, "8", 24
 OTHER_RESULT = "the result is another than the undisturbed one"
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGKILL)
@@ -213,7 +213,7 @@ def send_signals(job: Job, work: Path, seconds: float, count: int, chance: rando
             if found.ending in ("traceback", "hang") and found.status != 128 + kind:
                 wrong.append(f"{found.ending}: {found.last[:120]}")
             if "Traceback" in found.err:
-                wrong.append("a traceback")
+                wrong.append(f"a traceback: {found.err[-400:]!r}")
         yield Check(f"{kind.name} {number}", tuple(wrong))
         shutil.rmtree(folder)
 
