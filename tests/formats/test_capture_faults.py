@@ -194,7 +194,7 @@ FAULTS: dict[str, list[tuple[str, Edit, str | tuple[str, ...]]]] = {
     "transforms": [
         (JSON, content('{"frames": [}'), ("not JSON", "line 1, column 13")),
         (JSON, content('{\n"fl_x": 1,,\n}'), ("not JSON", "line 2, column 11")),
-        (JSON, content("[" * 100_000), ("not JSON", "recursion depth")),
+        (JSON, content("[" * 100_000), ("not JSON", "while decoding a JSON array")),
         (JSON, content(b'{"a": "\xff\xfe"}'), "not JSON"),
         (JSON, keys(frames=None), "no frames"),
         (JSON, keys(frames=[]), "frames is empty"),
