@@ -9,6 +9,8 @@ import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
+from bidnerf_core.errors import Cancelled, InputError
+
 # Windows has no SIGHUP.
 STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
@@ -29,6 +31,7 @@ class Handler:
         self.writes = False  # every signal waits until results are written
         self.works = False  # the first Ctrl-C waits until the work next checks whether to stop
         self.waiting: int | None = None
+        self.raised: int | None = None  # the last signal for which ``Interrupted`` was raised
         self.announce: Callable[[], object] = lambda: None  # tells the user that the work will stop
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
@@ -40,6 +43,7 @@ class Handler:
             if not self.writes:  # on a thread, since the handler may have interrupted a print
                 threading.Thread(target=self.announce).start()
         else:
+            self.raised = number
             raise Interrupted(number)
 
 
@@ -47,6 +51,8 @@ class Handler:
 def interruptions() -> Iterator[None]:
     """Make SIGINT, SIGTERM and SIGHUP raise ``Interrupted``. Signals that are ignored, as under nohup, stay ignored.
 
+    An import that is interrupted may fail in another way, as NumPy's does with a ``RecursionError``: an unexpected error after a signal
+    is an ``Interrupted``, too.
     Has no effect outside the main thread, the only thread that may handle signals.
     """
     in_main = threading.current_thread() is threading.main_thread()
@@ -55,6 +61,10 @@ def interruptions() -> Iterator[None]:
     before = {number: signal.signal(number, handler) for number in handled}
     try:
         yield
+    except Exception as error:
+        if handler.raised is None or isinstance(error, InputError | Cancelled | OSError):
+            raise
+        raise Interrupted(handler.raised) from error
     finally:
         for number, handler_before in before.items():
             signal.signal(number, handler_before)

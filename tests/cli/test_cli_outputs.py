@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import io
 import json
@@ -164,6 +165,29 @@ def test_an_interrupted_command_advises_what_it_can_do(
     assert status == 130
     assert kept in err
     assert "--resume" not in err
+
+
+@pytest.mark.parametrize(
+    ("interrupted", "error", "expected"),
+    [
+        (True, RecursionError("of an import"), Interrupted),  # as of NumPy's
+        (True, OSError("full disk"), OSError),
+        (True, InputError("what a user can mend"), InputError),
+        (False, RecursionError("of our own"), RecursionError),
+    ],
+)
+def test_an_unexpected_error_after_a_signal_is_an_interruption(
+    interrupted: bool, error: Exception, expected: type[BaseException]
+) -> None:
+    def fail() -> None:
+        with interruptions():
+            if interrupted:
+                with contextlib.suppress(KeyboardInterrupt):
+                    signal.raise_signal(signal.SIGTERM)
+            raise error
+
+    with pytest.raises(expected):
+        fail()
 
 
 def test_handlers_are_as_before_after_a_command_and_ignored_signals_stay_ignored(bidnerf: Run) -> None:
