@@ -1,8 +1,8 @@
 r"""The reliability of method ``auto``'s confidence: how often answers are right, as a diagram, and its calibration error.
 
-    python benchmarks/reliability.py benchmarks/results/faults_rgb.rows.jsonl ... --out docs/reliability.png
+    python benchmarks/reliability.py benchmarks/results/answers_new.rows.jsonl.xz ... --out docs/reliability.png
 
-Takes the rows of ``benchmarks/faults.py`` on frames that the confidence was not fitted to. Answers without a confidence are
+Takes the rows of ``benchmarks/answers.py`` on frames that the confidence was not fitted to. Answers without a confidence are
 counted and left out. Answers within 5 degrees and 0.05 units of the truth are right; a second criterion is whether the truth
 lies inside the 95 % bound of the answer's own covariance. The error is the expected calibration error in ten bins, overall and
 by scene.
@@ -10,12 +10,12 @@ by scene.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from _lab import BOUND, parser, record, within
+from answers import answers_of, read_rows
 from confidence import assess
 
 from bidnerf.results import COLOURS, common_style, new_figure
@@ -27,7 +27,7 @@ CRITERIA = {
 
 
 def rows_of(path: Path) -> list[dict[str, Any]]:
-    return [json.loads(text)["row"] for text in path.read_text().splitlines()]
+    return [row | {"scene": key[0].partition("@")[0]} for key, row in answers_of(read_rows(path)).items()]
 
 
 def reliability(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:

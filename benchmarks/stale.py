@@ -34,11 +34,10 @@ ROOT = Path(__file__).parents[1]
 
 IMAGES = tuple(f"bidnerf_core/{package}" for package in ("camera", "depth", "fields", "frames", "geometry"))
 HASHGRID = "backends/bidnerf_hashgrid"
-LOCALIZER = "bidnerf_core/maps/localizer.py"
-LOCALIZATION = (*IMAGES, "bidnerf_core/localization", "bidnerf_core/mapping", LOCALIZER, HASHGRID)
+LOCALIZATION = (*IMAGES, "bidnerf_core/localization", "bidnerf_core/mapping", HASHGRID)
 TRAINING = (*LOCALIZATION, "bidnerf_core/carving", "bidnerf_core/training")
 SHARED = tuple(f"bidnerf_core/localization/{part}" for part in ("methods.py", "problem.py", "settings.py", "terms"))
-DESCENT = (*IMAGES, *SHARED, LOCALIZER, "backends/bidnerf_bid", HASHGRID)
+DESCENT = (*IMAGES, *SHARED, "backends/bidnerf_bid", HASHGRID)
 MEASURED: Mapping[str, Sequence[str]] = {
     "quick_maps|standard_": TRAINING,
     "tracking": (*LOCALIZATION, "bidnerf_core/maps/tracker.py"),

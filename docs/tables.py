@@ -318,37 +318,53 @@ def _fault_label(name: str) -> str:
 
 # The README and the page of results
 
-CLEAN = {"RGB": "no_start_rgb", "RGB-D": "no_start_rgbd"}
-"""Records of method ``auto`` on images without faults."""
+
+def _cells(
+    records: Records, name: str, condition: str, where: Callable[[str], bool]
+) -> Iterator[tuple[str, str, Record]]:
+    """Yield the map, the input and the counts of each cell of a record of answers under a condition, of the maps ``where``."""
+    for key, conditions in records[name]["counts"].items():
+        scene, _, sensor = key.partition(", ")
+        if condition in conditions and where(scene):
+            yield scene, sensor, conditions[condition]
+
+
+def _sum(cells: Iterable[Record]) -> Record:
+    """Return the sums of counts of a record of answers."""
+    every = list(cells)
+    sums: Record = {key: sum(cell[key] for cell in every) for key in ("n", "right", "strict", "accepted", "silent")}
+    return sums | {"inside": [sum(cell["inside"][part] for cell in every) for part in (0, 1)]}
 
 
 @table
 def headline(records: Records) -> str:
-    """README's sentence about localization without a start."""
-    cells = {
-        sensor: [scene[sensor]["none"] for scene in records[name]["cells"].values()] for sensor, name in CLEAN.items()
-    }
-    every = [cell for some in cells.values() for cell in some]
-    counts = {sensor: [sum(cell[key] for cell in some) for key in ("right", "n")] for sensor, some in cells.items()}
-    accepted, wrong = (sum(cell[key] for cell in every) for key in ("converged", "silent"))
-    times = [cell["median_cpu_seconds"] for cell in every]
-    (a, b), (c, d) = counts.values()
+    """README's sentence about localization without a start, in maps of all training images."""
+    cells = list(_cells(records, "answers_unchanged", "all", lambda name: name in SCENES))
+    counts, scenes = {}, {}
+    for sensor in ("RGB", "RGB-D"):
+        some = [cell for _, which, cell in cells if which == sensor]
+        counts[sensor], scenes[sensor] = _sum(some), len(some)
+    every, (rgb, rgbd) = _sum(cell for _, _, cell in cells), counts.values()
+    wrong, times = every["silent"], [cell["median_s"] for _, _, cell in cells]
     text = (
-        f"Without a start, it localizes {a} of {b} held-out RGB images of {len(cells['RGB'])} scenes and {c} of {d} RGB-D images of"
-        f" {len(cells['RGB-D'])} scenes to within 5 degrees and 0.05 units. It accepts {accepted} of these poses, of which"
-        f" {wrong or 'none'} {'is' if wrong < 2 else 'are'} wrong. An image takes {min(times):.1f} to {max(times):.1f} seconds of"
-        " CPU time (median of a scene)."
+        f"Without a start, it localizes {rgb['right']} of {rgb['n']} held-out RGB images of {scenes['RGB']} scenes and"
+        f" {rgbd['right']} of {rgbd['n']} RGB-D images of {scenes['RGB-D']} scenes to within 5 degrees and 0.05 units. It accepts"
+        f" {every['accepted']} of these poses, of which {wrong or 'none'} {'is' if wrong < 2 else 'are'} wrong. An image takes"
+        f" {min(times):.1f} to {max(times):.1f} seconds of CPU time (median of a scene)."
     )
     return f"{textwrap.fill(text, 118)}\n\n{records.caption()}"
+
+
+PEERS = {
+    "auto": "`auto`",
+    "sift + pnp (pycolmap)": "SIFT, PnP (pycolmap)",
+    "open3d fpfh + ransac + icp": "RANSAC, ICP (Open3D)",
+}
 
 
 @table
 def peers(records: Records) -> str:
     """Method ``auto`` beside SIFT with PnP on RGB images, and beside ICP on the depth of RGB-D images, all without a start."""
-    names = {"auto": "`auto`", "sift + pnp (pycolmap)": "SIFT, PnP (pycolmap)", "open3d icp": "RANSAC, ICP (Open3D)"}
-    measured = [(scene, "RGB", found["RGB"]["peers"]) for scene, found in records["landmark_peers"]["scenes"].items()]
-    by_depth = [records[name] for name in ("registration_room", "registration_lego")]
-    measured += [(record["data"], "RGB-D", record["methods"]) for record in by_depth]
     rows = [
         (
             SCENES[scene],
@@ -357,11 +373,13 @@ def peers(records: Records) -> str:
             _of(found[name]["5deg 0.05"]),
             _of(found[name]["1deg 0.02"]),
             _length(found[name]["median_translation"]),
-            f"{found[name]['accepted']}, {found[name]['silent']} wrong" if "accepted" in found[name] else "",
+            "" if found[name]["accepted"] is None else f"{found[name]['accepted']}, {found[name]['silent']} wrong",
             _seconds(found[name]["median_cpu_seconds"]),
         )
-        for scene, images, found in measured
-        for name, title in names.items()
+        for images in ("RGB", "RGB-D")
+        for scene, modes in records["landmark_peers"]["scenes"].items()
+        if images in modes and len(found := modes[images]["peers"]) > 1
+        for name, title in PEERS.items()
         if name in found
     ]
     head = ("scene", "images", "method", "within 5°, 0.05", "within 1°, 0.02", "median error", "accepted", "CPU time")
@@ -381,92 +399,77 @@ def field_helps(records: Records) -> str:
 
 @table
 def training_times(records: Records) -> str:
-    """A sentence about what ``bidnerf train`` takes with default settings."""
-    names = (
-        "map_phone_doll",
-        "map_blender_lego",
-        "map_room_living",
-        "map_tum_fr1_xyz",
-        "map_iphone_corridor",
+    """A sentence about what ``bidnerf train`` takes with and without ``--quick``."""
+    scenes = records["quick_maps"]["quick"].values()
+    minutes, photos = (sorted(scene[key] for scene in scenes) for key in ("cpu_minutes", "photos"))
+    answers = [both for scene in scenes for both in scene["answers"].values()]
+    quick, more, n = (
+        sum(both[which][key] for both in answers)
+        for which, key in (("quick", "right"), ("default", "right"), ("quick", "n"))
     )
-    taken = [records[name]["training"] for name in names]
-    times = sorted(round(each["seconds"] / 60) for each in taken)
-    memory = sorted(each["peak_resident_GiB"] for each in taken)
     text = (
-        f"With default settings, `train` took {times[0]} to {times[-1]} minutes and {memory[0]:.1f} to {memory[-1]:.1f} GiB for each of five"
-        " scenes of 85 to 436 images, on two cores without a GPU."
+        f"`--quick` took {minutes[0]:.1f} to {minutes[-1]:.1f} minutes of CPU time for {len(scenes)} scenes of {photos[0]} to {photos[-1]} images,"
+        f" without a GPU; its maps find {quick} of {n} held-out images, maps of 1,500 default steps {more}."
     )
-    if (records.folder / "quick_maps.json").exists():
-        quick = [scene for scene in records["quick_maps"].values() if isinstance(scene, dict)]
-        minutes = sorted(scene["cpu_minutes"] for scene in quick)
-        asked = [both for scene in quick for both in scene["answers"].values()]
-        right, usual, n = (
-            sum(both[which][key] for both in asked)
-            for which, key in (("quick", "right"), ("default", "right"), ("quick", "n"))
-        )
-        text += (
-            f" `--quick` took {minutes[0]:.0f} to {minutes[-1]:.0f} minutes of CPU time; its maps find {right} of {n} images,"
-            f" maps of 1,500 default steps {usual}."
-        )
+    for name, scene in records["quick_maps"]["default"].items():
+        text += f" All {scene['steps']:,} steps of the default settings took {scene['cpu_minutes']:.0f} minutes ({SCENES[name]})."
     return f"{textwrap.fill(text, 118)}\n\n{records.caption()}"
 
 
 @table
 def other_answers(records: Records) -> str:
     """Answers to images, in maps, that no bound and no confidence was fitted to; both inputs of a scene together."""
-    keys, sums = ("n", "right", "strict", "accepted", "silent"), dict[str, list[int]]()
-    for name, some in records["answers_other_frames"]["counts"].items():
-        scene, _, sensor = name.partition(", ")
-        if (cell := some.get("all")) is not None and name != "all, all":
-            title = f"all, {sensor}" if scene == "all" else SCENES[scene]
-            known = sums.get(title, [0] * (len(keys) + 2))
-            sums[title] = [a + b for a, b in zip(known, (*(cell[key] for key in keys), *cell["inside"]), strict=True)]
-    rows = [(name, *counts[:-2], f"{counts[-2]}/{counts[-1]}") for name, counts in sums.items()]
-    head = (
-        "scene",
-        "answers",
-        "right",
-        "within 1°, 0.02",
-        "accepted",
-        "of these wrong",
-        "inside the 95 % bound",
-    )
-    return _table(head, rows, records)
+    rows = []
+    for name, title in SCENES.items():
+        scene = f"{name}@new"
+        rows.append(
+            (title, _sum(c for _, _, c in _cells(records, "answers_new", "all", lambda key, s=scene: key == s)))
+        )
+    for sensor in ("RGB", "RGB-D"):
+        every = _cells(records, "answers_new", "all", lambda key: key != "all")
+        rows.append((f"all, {sensor}", _sum(cell for _, which, cell in every if which == sensor)))
+    cells = [
+        (title, c["n"], c["right"], c["strict"], c["accepted"], c["silent"], f"{c['inside'][0]}/{c['inside'][1]}")
+        for title, c in rows
+    ]
+    head = ("scene", "answers", "right", "within 1°, 0.02", "accepted", "of these wrong", "inside the 95 % bound")
+    return _table(head, cells, records)
 
 
 @table
 def several_maps(records: Records) -> str:
     """Unchanged images on four maps of each scene, of which three are trained from halves of the training images."""
     maps = dict[tuple[str, str], list[dict[str, Any]]]()
-    for name, some in records["answers_unchanged"]["counts"].items():
-        scene, _, sensor = name.partition(", ")
-        if scene != "all":
-            maps.setdefault((SCENES[scene.partition("@")[0]], sensor), []).append(some["all"])
+    for name, sensor, cell in _cells(records, "answers_unchanged", "all", lambda key: key != "all"):
+        maps.setdefault((SCENES[name.partition("@")[0]], sensor), []).append(cell)
     rows = []
     for (scene, sensor), cells in maps.items():
-        sums = [sum(cell[key] for cell in cells) for key in ("n", "right", "strict", "accepted", "silent")]
-        inside = "/".join(str(sum(cell["inside"][part] for cell in cells)) for part in (0, 1))
+        c = _sum(cells)
         least = min((cell["accepted"] - cell["silent"]) / cell["right"] for cell in cells)
-        rows.append((scene, sensor, *sums, f"{least:.0%}", inside))
+        inside = f"{c['inside'][0]}/{c['inside'][1]}"
+        counts = (c["n"], c["right"], c["strict"], c["accepted"], c["silent"])
+        rows.append((scene, sensor, *counts, f"{least:.0%}", inside))
     head = ("scene", "input", "answers", "right", "within 1°, 0.02", "accepted", "of these wrong")
     return _table((*head, "right ones accepted, least of the maps", "inside the 95 % bound"), rows, records)
+
+
+UNKNOWN = {
+    "other scene": "another scene",
+    "plain wall": "a plain wall",
+    "twice": "a scene present twice",
+    "twice, start 5 deg": "a scene present twice, with a start near one copy",
+}
 
 
 @table
 def unknown(records: Records) -> str:
     """Images to which no answer is right, or more than one."""
     rows = []
-    for sensor, name in {"RGB": "faults_foreign", "RGB-D": "faults_foreign_rgbd"}.items():
-        c = records[name]["all"]
-        rows.append((f"{sensor} images of another scene", c["n"], c["converged"], c["silent"]))
-    for query, title in {
-        "RGB": "RGB, scene present twice",
-        "RGB-D": "RGB-D, scene present twice",
-        "RGB, start": "RGB, scene present twice, with a start near one copy",
-    }.items():
-        parts = [records[name]["all"][query] for name in ("repeated_scene", "repeated_scene_lego")]
-        n, accepted, right = (sum(part[key] for part in parts) for key in ("n", "believed", "believed and right"))
-        rows.append((title, n, accepted, accepted - right))
+    for condition, title in UNKNOWN.items():
+        for sensor in ("RGB", "RGB-D"):
+            every = _cells(records, "answers_new", condition, lambda key: key == "all")
+            c = _sum(cell for _, which, cell in every if which == sensor)
+            rows.append((f"{sensor}, {title}", c["n"], c["accepted"], c["silent"]))
     return _table(("images", "number", "accepted", "of these wrong"), rows, records)
 
 
@@ -474,8 +477,8 @@ def unknown(records: Records) -> str:
 def tracking(records: Records) -> str:
     """The tracker on two sequences, beside generalised ICP."""
     rows = []
-    for record, scene in {"tracking": "tum_fr1_xyz", "tracking_corridor": "iphone_corridor"}.items():
-        runs = records[record][scene]
+    for scene in ("tum_fr1_xyz", "iphone_corridor"):
+        runs = records["tracking"][scene]
         for name in ("RGB, in order", "RGB-D, in order", "RGB-D, GICP from the last pose"):
             if (run := runs.get(name)) is not None:
                 raw, way = (
@@ -493,28 +496,6 @@ def tracking(records: Records) -> str:
                     )
                 )
     return _table(("sequence", "method", "accepted", "of these wrong", "median error", "CPU per frame"), rows, records)
-
-
-@table
-def standard_layouts(records: Records) -> str:
-    """The standard benchmarks, tried on scenes of ours that were written in their layouts; RGB images."""
-    rows = []
-    for name, sensors in records["standard_layouts"].items():
-        c = sensors["RGB"]
-        median = f"{100 * c['median_translation']:.1f} cm, {c['median_rotation_deg']:.2f}°"
-        shares = [f"{c[share]:.0%}" for share in ("5 cm, 5 deg", "2 cm, 2 deg")]
-        inside = f"{c['inside_95_of_accepted']}/{c['accepted']}"
-        rows.append((name, median, *shares, f"{c['accepted']}/{c['n']}", c["wrong_of_accepted"], inside))
-    head = (
-        "scene, ground truth",
-        "median error",
-        "5 cm, 5°",
-        "2 cm, 2°",
-        "accepted",
-        "of these wrong",
-        "inside the 95 % bound",
-    )
-    return _table(head, rows, records)
 
 
 @table
@@ -567,7 +548,7 @@ def risk(records: Records) -> str:
                     counted(tested[risk]),
                     f"{tested[risk]['right_lost']} of {tested['right']}",
                     f"{halves['exceeded']} of {halves['halves_with_a_threshold']}",
-                    f"{counted(scenes[worst][risk])} ({SCENES.get(worst, worst)})",
+                    f"{counted(scenes[worst][risk])} ({SCENES[worst.partition('@')[0]]})",
                 )
             )
     head = (
@@ -615,16 +596,12 @@ def gpu(records: Records) -> str:
 
 
 def _successes(records: Records, name: str, condition: str, start: str = "bid, all sizes", within: str = "10%") -> str:
-    cells = records[name]["cells"]
-    (cell,) = [c for c in cells if c["condition"] == condition and c["start"] == start]
-    return _of(cell.get("success", cell.get("criteria"))[within])
-
-
-TABLE_1 = {
-    "table1_blender_lego": "Lego, `hashgrid`",
-    "table1_lego_vanilla": "Lego, `vanilla`",
-    "table1_chair": "chair, `hashgrid`",
-}
+    """Return the successes in the one cell whose condition has all parts of ``condition``, with Wilson's 95 % interval."""
+    parts = set(condition.split(", "))
+    cells = [c for c in records[name]["cells"] if parts <= set(c["condition"].split(", ")) and c["start"] == start]
+    (cell,) = cells
+    rate = cell["success"][within]["rate"]
+    return f"{rate['successes']} of {rate['trials']} ({100 * rate['low']:.0f} to {100 * rate['high']:.0f} %)"
 
 
 @table
@@ -635,29 +612,8 @@ def paper_depth(records: Records) -> str:
         for level, name in {"0": "coarse", "none": "fine"}.items():
             paper = records["table1_blender_lego"]["paper_percent"][f"{sensor} {name}"]
             condition = f"bid, {sensor}, level {level}"
-            found = (_successes(records, record, condition) for record in TABLE_1)
-            rows.append((f"{sensor}, {name}", f"{paper:.0f} %", *found))
-    return _table(("compared", "paper", *TABLE_1.values()), rows, records)
-
-
-@table
-def paper_images(records: Records) -> str:
-    """The paper's Table 2: one and several images."""
-    conditions = {
-        "1 image": "bid, 1 image, wide 1",
-        "8 images": "bid, 8 images, wide 1",
-        "8 images, wide": "bid, 8 images, wide 2",
-    }
-    sizes = ("0.9", "1.7", "3.4")
-    rows = []
-    for title, condition in conditions.items():
-        row = [title]
-        for size in sizes:
-            paper = records["table2_blender_lego"]["paper_percent"][title][size]
-            row.append(f"{paper:.0f} %; {_successes(records, 'table2_blender_lego', condition, f'bid {size}')}")
-        rows.append((*row, _successes(records, "table2_blender_lego", condition, within="1deg 0.02")))
-    head = ("images", *(f"start {size} away: paper; here" for size in sizes), "all sizes, within 1°, 0.02")
-    return _table(head, rows, records)
+            rows.append((f"{sensor}, {name}", f"{paper:.0f} %", _successes(records, "table1_blender_lego", condition)))
+    return _table(("compared", "paper", "Lego, `hashgrid`"), rows, records)
 
 
 @table
@@ -677,59 +633,6 @@ def paper_inerf(records: Records) -> str:
         (f"`{m}`", said[m], *(_successes(records, "inerf_blender_lego", m, "inerf", c) for c in criteria)) for m in said
     ]
     return _table(("method", "paper", *criteria.values()), rows, records)
-
-
-@table
-def schedule(records: Records) -> str:
-    """What the paper leaves open: learning rate, frame of the updates, scale of the Huber loss."""
-    rows = []
-    for pivot in ("scene", "camera"):
-        for rate, scale in (("0.02", "0.1"), ("0.01", "0.1"), ("0.02", "1")):
-            condition = f"bid, colour scale {scale}, depth scale {scale}, learning rate {rate}, pivot {pivot}"
-            found = (
-                _successes(records, "bid_schedule_blender_lego", condition, within=c) for c in ("10%", "5deg 0.05")
-            )
-            rows.append((f"`{pivot}`", rate, scale, *found))
-    head = ("`pivot`", "learning rate", "Huber scale", "10 % of the start's error", "within 5°, 0.05")
-    return _table(head, rows, records)
-
-
-@table
-def basin(records: Records) -> str:
-    """Settings of ``bid`` that may widen the basin of convergence."""
-    neutral = {
-        "blur": "0",
-        "box weight": "0",
-        "candidates": "1",
-        "free space weight": "0",
-        "opacity weight": "0",
-        "samples": "0",
-        "wide": "1",
-    }
-    variants: list[dict[str, str]] = [
-        {},
-        {"wide": "2"},
-        {"opacity weight": "0.3"},
-        {"free space weight": "1"},
-        {"candidates": "3"},
-        {"box weight": "1"},
-        {"box weight": "1", "candidates": "3"},
-    ]
-    name, sizes = "bid_reach_blender_lego", ("0.9", "1.7", "3.4")
-    rows = []
-    for variant in variants:
-        condition = "bid, " + ", ".join(f"{key} {value}" for key, value in {**neutral, **variant}.items())
-        title = ", ".join(f"`{key.replace(' ', '_')}` {value}" for key, value in variant.items())
-        found = (_successes(records, name, condition, f"bid {size}", "5deg 0.05") for size in sizes)
-        rows.append(
-            (
-                title or "the paper's objective",
-                *found,
-                _successes(records, name, condition, within="1deg 0.02"),
-            )
-        )
-    head = ("settings", *(f"start {size} away" for size in sizes), "all sizes, within 1°, 0.02")
-    return _table(head, rows, records)
 
 
 def main() -> None:
