@@ -117,6 +117,7 @@ def make(root: Path, name: str, command: str) -> str:
     if status:
         return f"{name}: FAILED with status {status}, see {log.name}"
     begun.unlink()
+    (results / f"{name}.meta.json").unlink(missing_ok=True)  # beside results from which a run resumes
     return f"{name}: made"
 
 
