@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import bidnerf as bn
-from bidnerf import InputError, View
+from bidnerf import InputError
 from bidnerf.scenes import closed_form_data
 from bidnerf_core.devices import map_tasks
 from bidnerf_core.mapping import build_landmarks, landmark_tensors
@@ -21,15 +21,11 @@ from bombs import png_of
 from commands import Run, assert_refused
 
 
-def room() -> list[View]:
-    dataset = closed_form_data("demo:room")
-    return dataset.views("train", dataset.frame_names("train")[:8])
-
-
 @pytest.mark.slow
 def test_landmarks_are_those_of_this_process_though_a_worker_is_killed() -> None:
     distributed = pytest.importorskip("distributed")
-    views = room()
+    dataset = closed_form_data("demo:room")
+    views = dataset.views("train", dataset.frame_names("train")[:8])
     expected, killed = build_landmarks(views), list[int]()
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50

@@ -73,22 +73,14 @@ def placeless(rows: Any) -> list[TrialResult]:
     return [dataclasses.replace(row, trial=dataclasses.replace(row.trial, map="", data="")) for row in timeless(rows)]
 
 
-@pytest.fixture
-def masks(shared: Path, tmp_path: Path) -> Callable[[Callable[[int], Any]], Path]:
-    """Writes masks of the test frames; the argument gives the pixels of each by its number, 255 where they are shown."""
-
-    def write(shown: Callable[[int], Any]) -> Path:
-        (tmp_path / "masks").mkdir()
-        for number, name in enumerate(open_dataset(shared / "data").frame_names("test")):
-            mask = np.empty((tiny.SIZE, tiny.SIZE), np.uint8)
-            mask[:] = shown(number)
-            iio.imwrite(tmp_path / "masks" / f"{name}.png", mask)
-        return tmp_path / "masks"
-
-    return write
-
-
-Masks = Callable[[Callable[[int], Any]], Path]
+def write_masks(folder: Path, data: Path, shown: Callable[[int], Any]) -> Path:
+    """Write masks of the test frames; ``shown`` gives the pixels of each by its number, 255 where they are shown."""
+    folder.mkdir()
+    for number, name in enumerate(open_dataset(data).frame_names("test")):
+        mask = np.empty((tiny.SIZE, tiny.SIZE), np.uint8)
+        mask[:] = shown(number)
+        iio.imwrite(folder / f"{name}.png", mask)
+    return folder
 
 
 def test_a_table_has_what_the_command_writes(shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -196,9 +188,10 @@ def test_results_say_where_a_map_in_memory_computed(monkeypatch: pytest.MonkeyPa
     assert seen == ["meta", "meta", "cpu"]
 
 
-def test_masks_hide_parts_of_the_images_in_every_trial(shared: Path, masks: Masks, tmp_path: Path) -> None:
+def test_masks_hide_parts_of_the_images_in_every_trial(shared: Path, tmp_path: Path) -> None:
     scene, data = shared / "map", shared / "data"
-    hiding = ["--masks", str(masks(lambda _: np.where(np.arange(tiny.SIZE) < tiny.SIZE // 2, 0, 255)))]
+    half = np.where(np.arange(tiny.SIZE) < tiny.SIZE // 2, 0, 255)
+    hiding = ["--masks", str(write_masks(tmp_path / "masks", data, lambda _: half))]
     words = [str(scene), str(data), *WORDS, "--trials", "2", "--seed", "5"]
     for number, more in enumerate(([], hiding, [*hiding, "--mask-hides", "white"])):
         assert main(["evaluate", *words, *more, "--out", str(tmp_path / f"{number}.jsonl")]) == 0
@@ -220,10 +213,11 @@ def test_masks_hide_parts_of_the_images_in_every_trial(shared: Path, masks: Mask
 
 
 def test_frames_that_masks_hide_wholly_are_named_and_left_out(
-    shared: Path, masks: Masks, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scene, data = shared / "map", shared / "data"
-    names, place = open_dataset(data).frame_names("test"), masks(lambda number: 255 if number else 0)
+    names = open_dataset(data).frame_names("test")
+    place = write_masks(tmp_path / "masks", data, lambda number: 255 if number else 0)
     words = [str(scene), str(data), *WORDS, "--masks", str(place)]
     assert main(["evaluate", *words, "--trials", "6", "--out", str(tmp_path / "r.jsonl")]) == 0
     told = f"masks hide 1 whole frame of {len(names)}, not tried: {names[0]}\n"

@@ -115,11 +115,12 @@ def test_a_dataset_with_a_damaged_file_is_refused_in_one_line_or_read(kind: str,
     chosen = st.sampled_from(list(sound))
     count = Counter[bool]()
 
-    def damaged(file: Path) -> st.SearchStrategy[tuple[Path, tuple[str, bytes]]]:
-        return st.tuples(st.just(file), draw_damage(FORMATS.get(file.suffix, of_bytes)(sound[file])))
-
     @settings(max_examples=12)
-    @given(case=chosen.flatmap(damaged))
+    @given(
+        case=chosen.flatmap(
+            lambda file: st.tuples(st.just(file), draw_damage(FORMATS.get(file.suffix, of_bytes)(sound[file])))
+        )
+    )
     def judged(case: tuple[Path, tuple[str, bytes]]) -> None:
         file, (_, content) = case
         file.write_bytes(content)

@@ -24,7 +24,6 @@ from bidnerf.testing import GROUND_CAMERA, TexturedGround, textured_map, texture
 from bidnerf.testing import POSES as GROUND_POSES
 from bidnerf_core.fields import FieldValues
 from bidnerf_core.localization import AutoConfig, LandmarkAnswer, LandmarkMatcher, LogisticModel, Loop, rig
-from bidnerf_core.mapping import LandmarkMap
 from bidnerf_core.registry import registered
 from conditions import (
     COPY,
@@ -236,18 +235,6 @@ def stated(view: View, factor: float) -> list[View]:
     return [replace(view, frame=frame)]
 
 
-def other_camera(factor: float) -> list[View]:
-    """Return a photo of a camera that is nearly the map's, and says so."""
-    camera = scaled(factor, GROUND_CAMERA)
-    return stated(textured_view(GROUND_POSES[1], camera=camera), 1.0)
-
-
-def own_correlation() -> LandmarkMap:
-    """Return landmarks of surer cameras, whose keypoints are as correlated as those of the map's images."""
-    built = require(textured_map().landmarks)
-    return replace(ground_landmarks(scatter=0.003), correlation=built.correlation)
-
-
 SHARP = AutoConfig(fused_rays=1024)
 GROUND: dict[str, tuple[Any, Expected]] = {
     "as stated, RGB": (lambda: noisy("none"), Right(metres=0.0075, degrees=0.18)),
@@ -264,7 +251,14 @@ GROUND: dict[str, tuple[Any, Expected]] = {
     "rig": (lambda: noisy("none", False, 1, 0), Right(metres=0.0058, degrees=0.12)),
     "depth 5 % too long": (lambda: noisy("depth-scale:1.05", True), Right(metres=0.0077, degrees=0.18)),
     "focal 0.5, not rendered": (
-        lambda: {"views": stated(unseen(), 0.5), "config": NOT_RENDERED, "landmarks": own_correlation()},
+        lambda: {
+            "views": stated(unseen(), 0.5),
+            "config": NOT_RENDERED,
+            # Of surer cameras; their keypoints are as correlated as those of the map's images.
+            "landmarks": replace(
+                ground_landmarks(scatter=0.003), correlation=require(textured_map().landmarks).correlation
+            ),
+        },
         MAP._replace(metres=0.03, degrees=1.0),
     ),
     "focal 1.02, not rendered": (
@@ -276,7 +270,10 @@ GROUND: dict[str, tuple[Any, Expected]] = {
         MAP._replace(metres=0.02),
     ),
     "another camera 0.97, rendered": (
-        lambda: {"views": other_camera(0.97), "config": SHARP},
+        lambda: {
+            "views": stated(textured_view(GROUND_POSES[1], camera=scaled(0.97, GROUND_CAMERA)), 1.0),
+            "config": SHARP,
+        },
         Right(metres=0.02),
     ),
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import imageio.v3 as iio
 import numpy as np
@@ -179,12 +180,7 @@ def test_folders_of_one_name_are_told_apart_by_those_around_them(
 def test_the_command(bidnerf: Run, grounds: list[Map], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Folders of maps, whose landmarks are read, and of which only those that are asked are loaded."""
     known = dict(zip(("m0", "m4", "bare"), grounds, strict=True))
-    loaded = []
-
-    def load(folder: Path, device: str = "cpu") -> Map:
-        loaded.append(folder.name)
-        return known[folder.name]
-
+    load = Mock(side_effect=lambda folder, device="cpu": known[folder.name])
     monkeypatch.setattr(collections_module, "load_info", lambda folder: known[folder.name].info)
     monkeypatch.setattr(collections_module, "read_part", lambda folder, info, part: known[folder.name].landmarks)
     monkeypatch.setattr(collections_module, "load_map", load)
@@ -197,7 +193,7 @@ def test_the_command(bidnerf: Run, grounds: list[Map], tmp_path: Path, monkeypat
     found = json.loads(out)
     assert (found["map"], found["converged"]) == ("m4", True)
     assert found["runner_up"]["converged"] is False
-    assert len(loaded) == 2
+    assert load.call_count == 2
     two = (tmp_path / "maps" / "m0", tmp_path / "maps" / "m4")
     out = bidnerf("localize", *two, file, "--focal", 130, "--out", tmp_path / "poses.json").succeed().out
     assert out.startswith("photo: in m4: accepted")

@@ -9,6 +9,7 @@ import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -82,13 +83,9 @@ def test_a_cancelled_and_an_interrupted_tracking_leave_their_frames(folder: Path
     with pytest.raises(bn.Cancelled):
         bn.track(scene(), folder, answers=path, each=lambda frame, answer: done.set(), cancel=done.is_set)
     assert len(path) == 1
-
-    def broken(progress: Progress) -> None:
-        raise ZeroDivisionError("of the callback")
-
     path = Answers(is_sequence=True)
     with pytest.raises(ZeroDivisionError, match="of the callback"):
-        bn.track(scene(), folder, answers=path, progress=broken)
+        bn.track(scene(), folder, answers=path, progress=Mock(side_effect=ZeroDivisionError("of the callback")))
     assert len(path) == 1
     with refused(found="every is 0", expected="1 or more"):
         bn.track(scene(), folder, every=0)

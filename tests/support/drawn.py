@@ -66,11 +66,6 @@ def bounds() -> SearchStrategy[SceneBounds]:
     )
 
 
-def traces() -> SearchStrategy[Trace]:
-    rows = st.lists(st.tuples(*[st.none() | numbers] * 2), min_size=1, max_size=3)
-    return rows.map(lambda pairs: Trace(*zip(*pairs, strict=True)))
-
-
 def dataset_options() -> SearchStrategy[DatasetOptions]:
     """Options of which JSON can hold every value."""
     text = st.none() | words
@@ -88,7 +83,9 @@ SPECIAL: dict[type, Callable[[], SearchStrategy[Any]]] = {
     DatasetOptions: dataset_options,
     Intrinsics: cameras,
     SceneBounds: bounds,
-    Trace: traces,
+    Trace: lambda: st.lists(st.tuples(*[st.none() | numbers] * 2), min_size=1, max_size=3).map(
+        lambda pairs: Trace(*zip(*pairs, strict=True))
+    ),
     bool: st.booleans,
     float: lambda: numbers,
     str: lambda: words,

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 from urllib.parse import quote
 
 import pytest
@@ -134,10 +135,7 @@ def test_the_start_and_the_seed_of_a_photo_are_used(room: Map, tmp_path: Path) -
 def test_internal_errors_are_for_the_log_alone(
     room: Map, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def fail(*given: Any, **more: Any) -> Any:
-        raise RuntimeError("/home/user/secret")
-
-    monkeypatch.setattr("bidnerf.viewer.app.answer_query", fail)
+    monkeypatch.setattr("bidnerf.viewer.app.answer_query", Mock(side_effect=RuntimeError("/home/user/secret")))
     with serving(room) as client:
         answer = answer_of(client, client.post("/api/query/0"))
     assert answer["outcome"] == "fault"
