@@ -238,7 +238,8 @@ class Run:
             with defer_interruptions():
                 if is_whole and total > 1:
                     more = f" in {len(answers.scene)} maps" if isinstance(answers.scene, MapCollection) else ""
-                    say(f"{len(answers.accepted)} of {total} accepted{more}")
+                    hint = "; --out poses.json writes all poses" if out is None and not self.output.json else ""
+                    say(f"{len(answers.accepted)} of {total} accepted{more}{hint}")
                 if is_whole and answers.world_mismatch is not None:
                     say(answers.world_mismatch)
                 is_written = out is not None and bool(answers if takes_all else answers.accepted)

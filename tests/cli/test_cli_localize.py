@@ -195,6 +195,12 @@ def test_files_of_poses_hold_what_converged(
         assert read[each["frame"]].frame.intrinsics == tiny.CAMERA
 
 
+def test_answers_to_several_photos_say_how_to_get_their_poses(bidnerf: Run, given: Path, place: list[Any]) -> None:
+    _, out, err = bidnerf(*place, given / "photos", *FOCAL).succeed()
+    assert [line.partition(":")[0] for line in out.splitlines()] == ["t_0000", "t_0001", "t_0002"]
+    assert "of 3 accepted; --out poses.json writes all poses" in err
+
+
 def test_without_an_accepted_pose_no_file_is_written(
     bidnerf: Run, given: Path, place: list[Any], tmp_path: Path
 ) -> None:
