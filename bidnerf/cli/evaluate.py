@@ -134,7 +134,7 @@ def run_evaluate(
     images: SeenImages = TEST_IMAGES,
     method: MethodGroup,
 ) -> None:
-    """Localize many frames of a dataset, and write one JSON line per trial.
+    """Localize many frames of a dataset, with a JSON line per trial.
 
     Trials begin at perturbed starts, or without a start. Finished trials are always kept: the same command resumes where it stopped.
     'bidnerf report' makes tables and figures from the results.

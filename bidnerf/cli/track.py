@@ -80,7 +80,7 @@ def run_track(
     images: Annotated[SeenImages, Without("split")],
     tracking: Annotated[TrackingOptions, Group("tracking", "How tracking begins, and which poses it accepts.")],
 ) -> None:
-    """Find the poses of a sequence's frames in a map, in chronological order.
+    """Find the poses of a sequence's frames in a map, one after another.
 
     Each pose is predicted from those before it, refined and validated. A frame whose pose is not accepted counts as lost; the
     following ones are searched for in the whole map. If the sequence has true poses, a table shows the errors.

@@ -21,7 +21,7 @@ from importlib.metadata import version
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO
 
 import psutil
 import torch
@@ -164,7 +164,7 @@ class ResultsFile:
         self.values: dict[str, TrialResult] = {}  # by the ``key_of`` of their trials
         self._file: BinaryIO | None = None
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> ResultsFile:
         if self.path is None:
             return self
         file = self._open(self.path)

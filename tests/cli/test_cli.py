@@ -23,7 +23,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 import tiny
-from bidnerf import Intrinsics, scenes
+from bidnerf import Intrinsics, Outcome, scenes
 from bidnerf.cli import COMMANDS, main
 
 # Inside: a line of progress, without a training that takes as long as the line says
@@ -419,7 +419,9 @@ def test_an_answer_that_is_not_finite_is_no_answer(bidnerf: Run, shared: Path, m
     real = Localizer.__call__
     nowhere = SE3(torch.eye(3).double(), torch.full((3,), math.nan).double())
     monkeypatch.setattr(
-        Localizer, "__call__", lambda *given, **more: replace(real(*given, **more), T_world_camera=nowhere)
+        Localizer,
+        "__call__",
+        lambda *given, **more: replace(real(*given, **more), T_world_camera=nowhere, outcome=Outcome.CONVERGED),
     )
     found = bidnerf("localize", shared / "map", shared / "data", "--frame", "t_0001", *QUICK, "--json")
     assert_refused(found, 1, "t_0001", "not finite")

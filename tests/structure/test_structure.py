@@ -221,7 +221,7 @@ def test_what_has_no_photos_or_has_poses(search: Search, tmp_path: Path, bidnerf
         (tmp_path / "nothing", "no such file or folder"),
         (tmp_path / "empty", "the folder is empty"),
         (search.out, "dataset whose poses are known"),
-        (search.photos / "000.png", "expected a folder of photos or a video"),
+        (search.photos / "000.png", "is a single photo, expected a folder of photos from several places, or a video"),
         (tmp_path / "clip.mp4", "no such file"),
     ]
     for place, message in cases:
