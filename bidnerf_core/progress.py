@@ -58,7 +58,8 @@ def job_context(
 
     Functions that take ``progress`` and ``cancel`` from users open this block once; the functions that they call report with
     ``counter`` and stop in ``check_cancelled``. What is None is inherited from the enclosing block. The executor, such as that of a
-    cluster, runs independent tasks (see ``devices.map_tasks``) in other processes, with the same results. Raises ``InputError`` if a callback is not callable (for example, if ``cancel`` is an event rather than its ``is_set``).
+    cluster, runs independent tasks (see ``devices.map_tasks``) in other processes, with the same results. Raises ``InputError`` if a
+    callback is not callable (for example, if ``cancel`` is an event rather than its ``is_set``).
     """
     for name, given, expected in (
         ("cancel", cancel, "a function, such as the is_set of an event"),

@@ -45,11 +45,8 @@ class RequestQueue(Generic[AnyExecutor]):
     def slot(self) -> Iterator[None]:
         """Occupy a slot within the block. Raises ``Refused`` if none is free."""
         if self.taken >= self.slots:
-            raise Refused(
-                429,
-                f"all {self.slots} places are taken, try again later",
-                {"Retry-After": str(self._retry_after()), "Connection": "close"},
-            )
+            headers = {"Retry-After": str(self._retry_after()), "Connection": "close"}
+            raise Refused(429, f"all {self.slots} places are taken, try again later", headers)
         self.taken += 1
         try:
             yield

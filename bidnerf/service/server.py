@@ -88,9 +88,8 @@ def serve(
         read_description(folder)  # here rather than in the process that loads the maps, which imports torch first
     import_extra("uvicorn", "serve", "the service")
     token = choose_token(host, token)
-    run_app(
-        service_app(scenes, token=token, **options), host, port, lambda address: ready and ready(address, token), stop
-    )
+    app = service_app(scenes, token=token, **options)
+    run_app(app, host, port, lambda address: ready and ready(address, token), stop)
 
 
 def choose_token(host: str | None, token: str | None) -> str | None:

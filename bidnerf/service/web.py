@@ -186,9 +186,8 @@ class Gate:
                 await problem(500, FAILED.format(number))(served, receive, answer)
         except asyncio.CancelledError:  # the server stops, and nothing waits for the end of this task
             if not status:
-                await problem(503, "the service is being stopped", {"Retry-After": "5", "Connection": "close"})(
-                    served, receive, answer
-                )
+                more = {"Retry-After": "5", "Connection": "close"}
+                await problem(503, "the service is being stopped", more)(served, receive, answer)
         self.report({**served, "method": scope["method"]}, status, time.perf_counter() - began, fault)
 
     def _admit(self, scope: Scope) -> ASGIApp:
@@ -213,12 +212,8 @@ class Gate:
 
 def problem(status: int, detail: str, headers: Mapping[str, str] | None = None, **more: Any) -> Response:
     """Return an error response in the format of RFC 9457."""
-    return Response(
-        json.dumps({"title": ERRORS.get(status, ("Error",))[0], "status": status, "detail": detail, **more}),
-        status,
-        headers,
-        PROBLEM,
-    )
+    body = {"title": ERRORS.get(status, ("Error",))[0], "status": status, "detail": detail, **more}
+    return Response(json.dumps(body), status, headers, PROBLEM)
 
 
 async def _answer_error(request: Request, error: Exception) -> Response:
@@ -395,14 +390,8 @@ def photo_request(*without: str) -> dict[str, Any]:
 
 def json_request(model: Any) -> dict[str, Any]:
     """Return the OpenAPI body of a request with JSON that matches ``model``."""
-    return {
-        "requestBody": {
-            "required": True,
-            "content": {
-                "application/json": {"schema": model.model_json_schema(ref_template="#/components/schemas/{model}")}
-            },
-        }
-    }
+    schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
+    return {"requestBody": {"required": True, "content": {"application/json": {"schema": schema}}}}
 
 
 def error_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:

@@ -69,9 +69,8 @@ class LoadedMaps:
             if (protocol := task.get("protocol")) is None:
                 _, body = localize(task["upload"])
             else:
-                body = SERVICES[protocol].answer(
-                    _validated(SERVICES[protocol].request, task["body"]), self.scenes[task["map"]], localize
-                )
+                given = _validated(SERVICES[protocol].request, task["body"])
+                body = SERVICES[protocol].answer(given, self.scenes[task["map"]], localize)
             reply: dict[str, Any] = {"status": 200, "body": body}
         except Refused as error:
             reply = {"status": error.status, "detail": error.detail, "more": error.more}
@@ -161,13 +160,11 @@ def _load(order: Mapping[str, Any]) -> LoadedMaps:
     cv2.setNumThreads(1)
     config = settings_of(order["method"], order["config"])
     warm_up = order["device"] == "cpu"
-    return LoadedMaps(
-        {
-            name: Localizer(load_map(folder), order["method"], config, warm_up=warm_up)
-            for name, folder in order["maps"].items()
-        },
-        order["max_pixels"],
-    )
+    localizers = {
+        name: Localizer(load_map(folder), order["method"], config, warm_up=warm_up)
+        for name, folder in order["maps"].items()
+    }
+    return LoadedMaps(localizers, order["max_pixels"])
 
 
 def _serve(maps: LoadedMaps, device: str, stream: BufferedRWPair) -> None:
@@ -177,13 +174,11 @@ def _serve(maps: LoadedMaps, device: str, stream: BufferedRWPair) -> None:
     """
     try:
         if device != "cpu":
-            maps = LoadedMaps(
-                {
-                    name: Localizer(maps.scenes[name], each.method, each.config, device)
-                    for name, each in maps.localizers.items()
-                },
-                maps.max_pixels,
-            )
+            moved = {
+                name: Localizer(maps.scenes[name], each.method, each.config, device)
+                for name, each in maps.localizers.items()
+            }
+            maps = LoadedMaps(moved, maps.max_pixels)
     except (InputError, RuntimeError) as error:
         _send(stream, {"error": str(error)})
         return

@@ -10,7 +10,7 @@ import contextlib
 import signal
 import threading
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -31,6 +31,7 @@ from bidnerf_core.camera import (
     reduced_size,
 )
 from bidnerf_core.datasets import Capture, Shot
+from bidnerf_core.devices import map_tasks
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.installation import import_extra
 from bidnerf_core.io import read_header, read_image
@@ -178,22 +179,20 @@ def write_keypoints(database: Any, photos: PhotoSet, pycolmap: Any) -> None:
     """
     count, total = counter("finding keypoints", "photos"), len(photos.photos)
     missing = [photo for photo in photos.photos if not database.exists_keypoints(photo.number)]
-    with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
-        try:
-            for done, (photo, keypoints) in enumerate(zip(missing, pool.map(_keypoints, missing), strict=True)):
-                if isinstance(keypoints, InputError):
-                    photos.unusable[photo.shot.name] = _without_file(keypoints, photo.file)
-                    photos.photos.remove(photo)
-                else:
-                    descriptors = pycolmap.FeatureDescriptors(
-                        pycolmap.FeatureExtractorType.SIFT, keypoints.descriptors.numpy()
-                    )
-                    with pycolmap.DatabaseTransaction(database):
-                        database.write_keypoints(photo.number, keypoints.pixels.float().numpy())
-                        database.write_descriptors(photo.number, descriptors)
-                count(total - len(missing) + done + 1, total)
-        finally:
-            pool.shutdown(cancel_futures=True)
+    tasks: Any = map_tasks(_keypoints, ((photo,) for photo in missing))
+    with closing(tasks) as found:
+        for done, (photo, keypoints) in enumerate(zip(missing, found, strict=True)):
+            if isinstance(keypoints, InputError):
+                photos.unusable[photo.shot.name] = _without_file(keypoints, photo.file)
+                photos.photos.remove(photo)
+            else:
+                descriptors = pycolmap.FeatureDescriptors(
+                    pycolmap.FeatureExtractorType.SIFT, keypoints.descriptors.numpy()
+                )
+                with pycolmap.DatabaseTransaction(database):
+                    database.write_keypoints(photo.number, keypoints.pixels.float().numpy())
+                    database.write_descriptors(photo.number, descriptors)
+            count(total - len(missing) + done + 1, total)
 
 
 def _keypoints(photo: ListedPhoto) -> Keypoints | InputError:

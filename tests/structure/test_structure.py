@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 import sys
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -42,12 +44,14 @@ from bidnerf_core.geometry import fit_similarity, look_at
 
 # Inside: each stage of the search for poses, with its rare geometry
 from bidnerf_core.maps.training import open_posed_images, poses_folder
+from bidnerf_core.progress import job_context
 from commands import Run
 from optional import require
 from photo_files import write_photo
 from photo_room import CAMERA, photograph, room_depth, walk, write_photos
 from refusals import refused
 from scan_layouts import write_tum
+from trainings import stopping_at
 
 pytestmark = pytest.mark.slow
 
@@ -213,6 +217,20 @@ def test_a_folder_inside_and_names_that_occur_twice(tmp_path: Path) -> None:
     assert lacks_poses(tmp_path / "capture")
     images = photos_of(tmp_path / "capture")
     assert images.names == ["cam0_000", "cam0_001", "cam1_000", "cam1_001"]
+
+
+def test_keypoints_are_detected_where_the_job_says(search: Search, tmp_path: Path) -> None:
+    tasks = list[str]()
+
+    class Elsewhere(ThreadPoolExecutor):
+        def submit(self, task: Callable[..., Any], /, *given: Any, **more: Any) -> Future[Any]:
+            tasks.append(Path(given[0].file).name)
+            return super().submit(task, *given, **more)
+
+    with Elsewhere(1) as executor, job_context(executor=executor), pytest.raises(bn.Cancelled):
+        bn.find_poses(search.photos, tmp_path / "out", **stopping_at("matching photos"))
+    readable = sorted(photo.name for photo in search.photos.iterdir() if photo.name != "202.jpg")
+    assert tasks == readable
 
 
 def test_what_has_no_photos_or_has_poses(search: Search, tmp_path: Path, bidnerf: Run) -> None:

@@ -94,9 +94,8 @@ def epipolar_matches(a: ImageKeypoints, b: ImageKeypoints) -> PairMatches:
         best[rows], partner[rows] = banded.min(1)
         least = least.minimum(banded.amin(0))
     mutual = ((best == least[partner]) & best.isfinite()).nonzero()[:, 0]
-    first = torch.full((m,), n).scatter_reduce(
-        0, partner[mutual], mutual, "amin"
-    )  # of keypoints with equal descriptors
+    # Of keypoints with equal descriptors, the first one
+    first = torch.full((m,), n).scatter_reduce(0, partner[mutual], mutual, "amin")
     mutual = mutual[first[partner[mutual]] == mutual]
     good, ambiguity = torch.zeros(len(mutual), dtype=torch.bool), torch.zeros(len(mutual))
     for some in torch.arange(len(mutual)).split(size):
