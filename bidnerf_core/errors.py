@@ -13,8 +13,8 @@ class InputError(ValueError):
 
     The message names settings as Python does, in backticks; programs with other names for them use ``spelled``.
 
-    The message is a single line, ``where: found, expected ...``, which can be shown to the user unchanged; its parts
-    are attributes: ``where`` is the file, frame, argument or setting that is wrong, or None if the message does not begin
+    The message is a single line, ``where: found, expected ...``, which can be shown to the user unchanged, since it is
+    made ``printable`` whatever names and text of files it repeats; its parts are attributes: ``where`` is the file, frame, argument or setting that is wrong, or None if the message does not begin
     with one; ``found`` is what was found there, or the whole problem; ``expected`` is what was expected, with any advice
     that follows, or None if the message does not say. If ``found`` ends in a colon or a semicolon, no comma is added.
     ``InputError(error, where=path)`` adds context to ``error``: ``path`` is put before ``error.where``, and the other
@@ -26,9 +26,9 @@ class InputError(ValueError):
         if isinstance(found, InputError):
             parts.append(found.where)
             expected, found = found.expected if expected is None else expected, found.found
-        self.where: str | None = ": ".join(str(part) for part in parts if part) or None
-        self.found: str = str(found)
-        self.expected: str | None = None if expected is None else str(expected)
+        self.where: str | None = ": ".join(single_line(part) for part in parts if part) or None
+        self.found: str = single_line(found)
+        self.expected: str | None = None if expected is None else single_line(expected)
         problem = self.found
         if self.expected is not None:
             comma = "" if problem.endswith((":", ";")) or not problem else ","
@@ -51,6 +51,9 @@ class UsageError(InputError):
 
 class InputWarning(UserWarning):
     """Warning that an input is ambiguous; the message is a single line that states the convention that was assumed."""
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(single_line(message))
 
 
 class Cancelled(Exception):
@@ -94,3 +97,8 @@ def printable(text: str) -> str:
     may contain any of them.
     """
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def single_line(text: object) -> str:
+    """Return ``text`` as one ``printable`` line."""
+    return printable(" ".join(str(text).splitlines()))

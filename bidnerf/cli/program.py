@@ -13,7 +13,16 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TextIO
 
 from bidnerf.cli.signals import Interrupted, interruptions
-from bidnerf_core.errors import Cancelled, InputError, InputWarning, UsageError, printable, spelled, spelling_hint
+from bidnerf_core.errors import (
+    Cancelled,
+    InputError,
+    InputWarning,
+    UsageError,
+    printable,
+    single_line,
+    spelled,
+    spelling_hint,
+)
 from bidnerf_core.registry import Plugins, list_plugins
 
 
@@ -172,7 +181,7 @@ class _Lines(logging.Handler):
 def _report(name: str, message: str, status: int, more: str = "") -> int:
     """Print the reason for a failure, or a warning, on one line, and return ``status``, even if stderr is closed."""
     with contextlib.suppress(OSError):
-        print(f"{name}: {printable(' '.join(spelled(message, option_name).splitlines()))}", file=sys.stderr)
+        print(f"{name}: {single_line(spelled(message, option_name))}", file=sys.stderr)
         print(more, end=more and "\n", file=sys.stderr, flush=True)
     return status
 
