@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import warnings
 import weakref
-from collections import OrderedDict, deque
+from collections import OrderedDict, abc, deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
@@ -401,11 +401,11 @@ AHEAD = 64
 """Number of tasks submitted ahead of the results, which bounds the memory of what runs them."""
 
 
-def map_tasks(work: Callable[..., Value], tasks: Iterable[tuple[Any, ...]]) -> Iterator[Value]:
+def map_tasks(work: Callable[..., Value], tasks: Iterable[tuple[Any, ...]]) -> abc.Generator[Value, None, None]:
     """Yield ``work(*task)`` for each of the independent tasks, in order.
 
     The executor of this thread's job runs them (see ``job_context``), otherwise as many threads as torch uses. Other processes receive
-    ``work`` and the tasks by pickle.
+    ``work`` and the tasks by pickle. Closing the generator cancels the tasks that wait.
     """
     executor = current_job().executor
     with ThreadPoolExecutor(max(1, torch.get_num_threads())) if executor is None else nullcontext(executor) as pool:

@@ -179,8 +179,7 @@ def write_keypoints(database: Any, photos: PhotoSet, pycolmap: Any) -> None:
     """
     count, total = counter("finding keypoints", "photos"), len(photos.photos)
     missing = [photo for photo in photos.photos if not database.exists_keypoints(photo.number)]
-    tasks: Any = map_tasks(_keypoints, ((photo,) for photo in missing))
-    with closing(tasks) as found:
+    with closing(map_tasks(_keypoints, ((photo,) for photo in missing))) as found:
         for done, (photo, keypoints) in enumerate(zip(missing, found, strict=True)):
             if isinstance(keypoints, InputError):
                 photos.unusable[photo.shot.name] = _without_file(keypoints, photo.file)

@@ -200,3 +200,9 @@ def test_an_inverted_file_selects_once_from_all_cells(
     assert torch.equal(number[:, 0], torch.arange(200))
     assert torch.equal(squared_distances(many[:200], many).gather(1, number), distance)
     assert bool((distance.diff(dim=1) >= 0).all())
+
+
+def test_cells_of_other_descriptors_are_refused(generator: torch.Generator) -> None:
+    many = torch.randint(0, 256, (5000, 16), generator=generator, dtype=torch.uint8)
+    with pytest.raises(ValueError, match="cells of 5000 descriptors, expected those of the given 4900"):
+        InvertedFile(many[100:], DescriptorCells.of(many))

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from bidnerf import SE3, Frame, InputError, Intrinsics, View
+from bidnerf import SE3, Cancelled, Frame, InputError, Intrinsics, View
 from bidnerf_core.geometry import look_at
 from bidnerf_core.mapping import (
     LandmarkConfig,
@@ -132,6 +135,37 @@ def test_progress_ends_at_its_total() -> None:
     with job_context(reports.append):
         build_landmarks(ring(points, 4), points)
     assert [report.done for report in reports] == list(range(reports[-1].total + 1))
+
+
+class LastOfAll(Executor):
+    """Runs the tasks only when it is closed, but for the first, unless they were cancelled by then."""
+
+    def __init__(self) -> None:
+        self.waiting = list[tuple[Future[object], Callable[[], object]]]()
+        self.run = 0
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future = Future[Any]()
+        self.waiting.append((future, lambda: fn(*args, **kwargs)))
+        if len(self.waiting) == 1:
+            self.finish()
+        return future
+
+    def finish(self) -> None:
+        for future, work in self.waiting:
+            if not future.done() and future.set_running_or_notify_cancel():
+                self.run += 1
+                future.set_result(work())
+
+
+def test_tasks_that_wait_are_not_done_after_the_job_is_cancelled() -> None:
+    points, executor = Points(count=50), LastOfAll()
+    with pytest.raises(Cancelled) as caught, job_context(cancel=lambda: executor.run > 0, executor=executor):
+        build_landmarks(ring(points, 9), points)
+    executor.finish()
+    assert caught.value  # whose traceback keeps the generator alive
+    assert len(executor.waiting) == 9
+    assert executor.run == 1
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from math import ceil, radians
@@ -328,12 +329,13 @@ def _triangulate(
     return observations, points[numbers], covariance[numbers]
 
 
-def _counted(results: Iterable[Result], step: Callable[[], None]) -> list[Result]:
-    """Return the results, and call ``step`` after each."""
+def _counted(results: Generator[Result, None, None], step: Callable[[], None]) -> list[Result]:
+    """Return the results of tasks, and call ``step`` after each. If it raises, the tasks that wait are cancelled."""
     counted = []
-    for result in results:
-        step()
-        counted.append(result)
+    with closing(results):
+        for result in results:
+            step()
+            counted.append(result)
     return counted
 
 

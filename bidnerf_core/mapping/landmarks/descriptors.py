@@ -156,11 +156,14 @@ class DescriptorCells:
 class InvertedFile:
     """An inverted file: descriptors sorted by cells, of which only the nearest are searched (Sivic and Zisserman 2003).
 
-    Descriptors that are in the order of their cells are not copied.
+    Descriptors that are in the order of their cells are not copied. Raises ``ValueError`` if the cells are those of another
+    number of descriptors.
     """
 
     def __init__(self, descriptors: UInt8[Tensor, "n d"], cells: DescriptorCells) -> None:
         self._centres, cell = cells.centres, cells.cell
+        if len(cell) != len(descriptors):
+            raise ValueError(f"cells of {len(cell)} descriptors, expected those of the given {len(descriptors)}")
         self._order = cell.argsort(stable=True)
         is_sorted = bool((cell.diff() >= 0).all())
         self._descriptors = descriptors if is_sorted else descriptors[self._order]
