@@ -226,7 +226,7 @@ def training_poses(
     landmarks of the other photos. All poses are refined if errors of the given poses add at least ``least`` pixels to the
     standard deviation of the keypoints; otherwise they are kept.
     """
-    seen, _ = tracked.triangulate(config)
+    seen, points = tracked.triangulate(config)
     wrong = {
         number: photo
         for number, photo in relocate_photos(tracked, views, suspects(seen, link_photos(seen)), config).items()
@@ -236,7 +236,7 @@ def training_poses(
         updates = torch.zeros(len(views), 6, dtype=torch.float64)
         for number, photo in wrong.items():
             updates[number] = photo.update
-        tracked = tracked.at(tracked.T_world_camera.retract(updates)).rematch(config)
+        tracked = tracked.at(tracked.T_world_camera.retract(updates)).rematch(config, seen, points)
     fit = adjust_poses(tracked, config, least)
     pixels, refined = torch.zeros(len(views), dtype=torch.float64), False
     if fit is not None and fit[2].inconsistency >= least:
@@ -246,7 +246,7 @@ def training_poses(
         for number in wrong:
             poses.rotation[number] = better.rotation[number]
             poses.translation[number] = better.translation[number]
-        tracked = tracked.at(poses).rematch(config)
+        tracked = tracked.at(poses).rematch(config, *fit[0].triangulate(config))
     for number, photo in wrong.items():
         pixels[number] = photo.pixels
     return TrainingPoses(tracked, pixels, list(wrong), refined, None if fit is None else fit[2])
@@ -298,7 +298,7 @@ def adjust_poses(
         consistency = PoseRefinement(before, noise_of(seen, points))
         if number == 0 and not noticed and consistency.inconsistency < least:
             break
-        tracked = tracked.rematch(config)
+        tracked = tracked.rematch(config, seen, points)
         seen, points = tracked.triangulate(config)
         consistency = PoseRefinement(before, noise_of(seen, points))
         if float(step.max()) <= 0.25 and not noticed:  # pixels

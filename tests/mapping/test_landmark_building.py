@@ -222,7 +222,18 @@ def test_parallax_is_the_angle_between_two_rays() -> None:
     assert float(parallax(seen, torch.zeros(1, 3, dtype=torch.float64))) == pytest.approx(0.2)
 
 
-def test_matches_near_epipolar_lines_are_those_of_an_exhaustive_search(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "motion",
+    [
+        pytest.param([0.4, 0.1, 0.2, -0.1, 0.3, 0.05], id="around"),
+        pytest.param([0.0, 0.0, 0.5, 0.0, 0.0, 0.0], id="forward"),  # the epipole is in the middle of the image
+        pytest.param([0.3, 0.0, 0.0, 0.0, 0.0, 0.0], id="sideways"),  # and here at infinity
+        pytest.param([0.0, 0.0, 0.0, 0.02, 0.05, 0.1], id="turning"),  # there is none
+    ],
+)
+def test_matches_near_epipolar_lines_are_those_of_an_exhaustive_search(
+    monkeypatch: pytest.MonkeyPatch, motion: list[float]
+) -> None:
     points = Points(count=150, noise=1.0)
     generator = torch.Generator().manual_seed(0)
 
@@ -233,7 +244,9 @@ def test_matches_near_epipolar_lines_are_those_of_an_exhaustive_search(monkeypat
 
     # Of points that look alike the lines decide, and the ratio test refuses some.
     points.descriptors = noisy(points.descriptors[torch.arange(150) % 40], 40)
-    a, b = (image_keypoints(view, points) for view in ring(points)[:2])
+    first = looking_in(0.0, 0.0)
+    second = first.retract(torch.tensor(motion, dtype=torch.float64))
+    a, b = (image_keypoints(points.view(T, seed=seed), points) for seed, T in enumerate((first, second)))
     b.keypoints.descriptors[:] = noisy(b.keypoints.descriptors, 25)
     # Of keypoints with equal descriptors near the line, the first is the nearest.
     a.keypoints.descriptors[5] = a.keypoints.descriptors[4]
@@ -258,6 +271,7 @@ def test_matches_near_epipolar_lines_are_those_of_an_exhaustive_search(monkeypat
     assert {(i, j) for i, j in whole.pairs.tolist()} == expected
     assert 10 < len(expected) < len(a.keypoints)
     monkeypatch.setattr("bidnerf_core.mapping.landmarks.tracks.CACHED", 500)  # blocks of a few rows
+    monkeypatch.setattr("bidnerf_core.mapping.landmarks.tracks.ROWS", 7)
     parts = epipolar_matches(a, b)
     assert torch.equal(parts.pairs, whole.pairs)
     assert torch.equal(parts.ambiguity, whole.ambiguity)

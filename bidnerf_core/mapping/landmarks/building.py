@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from math import ceil, radians
-from typing import Annotated, TypeVar
+from typing import Annotated, TypeAlias, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -49,15 +49,22 @@ from bidnerf_core.mapping.landmarks.tracks import (
     link_tracks,
 )
 from bidnerf_core.mapping.resection.reprojection import resections
+from bidnerf_core.mapping.resection.states import pinhole
 from bidnerf_core.progress import counter
 from bidnerf_core.registry import PluginError
 from bidnerf_core.settings import Above, Range, Settings
 
 LEAST_VISIBLE_POINTS = 20
 """Minimum number of points from which the pose of an image is estimated."""
+SETTLED = 0.25
+"""Motion of points in an image (pixels) up to which the matches of a pair are kept when poses change: an eighth of the epipolar band."""
+SAMPLE = 32
+"""Number of points from which that motion is estimated; images that see fewer than a quarter of it are matched again."""
 ENOUGH_IMAGES = 8
 """Minimum number of images from which the covariance of pose updates is estimated."""
 Result = TypeVar("Result")
+PosedMatches: TypeAlias = dict[tuple[int, int], tuple[SE3, PairMatches]]
+"""The matches of pairs of images, with the pose T_second_first of the cameras with which they were found."""
 
 
 def update_scatter(updates: Sequence[Float[Tensor, "6"] | None]) -> Float[Tensor, "6 6"] | None:
@@ -146,6 +153,7 @@ class TrackedViews:
     features: str | Features = USUAL_FEATURES  # the detector of the keypoints: its name, if it is registered
     # Positions (metres, world, float64) of the points by number, if they are known; otherwise they are triangulated.
     points: Float[Tensor, "p 3"] | None = None
+    matches: PosedMatches = field(default_factory=dict)  # from which the tracks were joined, if they are known
 
     def detector_of(self, view: View, number: int) -> Features:
         """Return a detector for queries with ``view``, which is image ``number``; the detector reuses the image's keypoints."""
@@ -205,11 +213,17 @@ class TrackedViews:
         ]
         return replace(self, observations=replace(self.observations, images=images))
 
-    def rematch(self, config: LandmarkConfig) -> TrackedViews:
-        """Match the same keypoints again, with the current poses, and return the new tracks."""
+    def rematch(self, config: LandmarkConfig, seen: TrackedKeypoints, points: Float[Tensor, "n 3"]) -> TrackedViews:
+        """Match the keypoints again where the poses have changed since they were matched, and return the new tracks.
+
+        A pair of images keeps its matches if its relative pose has hardly moved the ``points`` (metres, world) that are ``seen`` in the
+        image.
+        """
         images = self.observations.images
         pairs = likely_pairs([image.T_ref_camera for image in images], config.neighbours)
-        return replace(self, observations=_link_keypoints(images, pairs, _counter("poses", "image pairs", len(pairs))))
+        matches = {pair: self.matches[pair] for pair in _settled(images, pairs, self.matches, _samples(seen, points))}
+        matches = _match_pairs(images, pairs, matches, _counter("poses", "image pairs", len(pairs)))
+        return replace(self, observations=_link_keypoints(images, matches), matches=matches)
 
     def without(self, images: Sequence[int]) -> TrackedViews:
         """Return the tracks without the keypoints of ``images``, and without known points, whose positions may come from these images."""
@@ -249,24 +263,64 @@ def track_views(
             expected="the same number",
         )
     if labels is None:
-        return TrackedViews(_link_keypoints(images, pairs, step, known(images)), features)
+        matches = _match_pairs(images, pairs, {}, step)
+        return TrackedViews(_link_keypoints(images, matches, known(images)), features, matches=matches)
     if len(labels) != sum(len(image.keypoints) for image in images):  # the detector has changed meanwhile
         return track_views(views, features, config, known)
     return TrackedViews(TrackedKeypoints(images, labels.long(), torch.arange(len(labels))), features)
 
 
+def _match_pairs(
+    images: Sequence[ImageKeypoints], pairs: Int[Tensor, "p 2"], matches: PosedMatches, step: Callable[[], None]
+) -> PosedMatches:
+    """Return the matches between the keypoints of the pairs of images, of which some ``matches`` are known."""
+    listed = [(i, j) for i, j in pairs.tolist()]
+    left = [pair for pair in listed if pair not in matches]
+    for _ in range(len(listed) - len(left)):
+        step()
+    new = _counted(map_tasks(epipolar_matches, ((images[i], images[j]) for i, j in left)), step)
+    poses = [images[j].T_ref_camera.inverse() @ images[i].T_ref_camera for i, j in left]
+    matches = matches | dict(zip(left, zip(poses, new, strict=True), strict=True))
+    return {pair: matches[pair] for pair in listed}
+
+
 def _link_keypoints(
-    images: Sequence[ImageKeypoints],
-    pairs: Int[Tensor, "p 2"],
-    step: Callable[[], None],
-    known: Sequence[tuple[int, int, PairMatches]] = (),
+    images: Sequence[ImageKeypoints], matches: PosedMatches, known: Sequence[tuple[int, int, PairMatches]] = ()
 ) -> TrackedKeypoints:
-    """Match the keypoints of the pairs of images, and join the matches into tracks, starting with ``known`` ones of ambiguity 0."""
-    listed = pairs.tolist()
-    matches = _counted(map_tasks(epipolar_matches, ((images[i], images[j]) for i, j in listed)), step)
-    matched = [(i, j, m) for (i, j), m in zip(listed, matches, strict=True)]
+    """Join the matches into tracks, starting with ``known`` ones of ambiguity 0."""
+    matched = [(i, j, found) for (i, j), (_, found) in matches.items()]
     label = link_tracks([*known, *matched], [len(image.keypoints) for image in images])
     return TrackedKeypoints(images, label, torch.arange(len(label)))
+
+
+def _samples(seen: TrackedKeypoints, points: Float[Tensor, "n 3"]) -> Float[Tensor, "v s 3"]:
+    """Return evenly spread ``points`` that each image sees, in its camera frame (metres), or NaN if it sees too few."""
+    counts = torch.bincount(seen.image, minlength=len(seen.images))
+    rank = torch.arange(SAMPLE) * counts[:, None] // SAMPLE + (counts.cumsum(0) - counts)[:, None]
+    local = seen.sightings.in_camera(points)[seen.image.argsort(stable=True)]
+    samples = torch.full((*rank.shape, 3), torch.nan, dtype=local.dtype)
+    enough = counts >= SAMPLE / 4
+    samples[enough] = local[rank[enough]]
+    return samples
+
+
+def _settled(
+    images: Sequence[ImageKeypoints],
+    pairs: Int[Tensor, "p 2"],
+    matches: PosedMatches,
+    samples: Float[Tensor, "v s 3"],
+) -> list[tuple[int, int]]:
+    """Return the pairs of images whose current relative pose moves the second one's ``samples`` hardly from where they were matched."""
+    both = [(i, j) for i, j in pairs.tolist() if (i, j) in matches]
+    if not both:
+        return []
+    first, second = (SE3.stack([images[i].T_ref_camera for i in part]) for part in zip(*both, strict=True))
+    local = samples[[j for _, j in both]]
+    change = SE3.stack([matches[pair][0] for pair in both]) @ first.inverse() @ second
+    earlier = SE3(change.rotation[:, None], change.translation[:, None]).apply(local)
+    away = torch.linalg.vector_norm(pinhole(earlier)[0] - pinhole(local)[0], dim=-1).median(1).values
+    pixels = away * torch.tensor([images[j].focal for _, j in both], dtype=away.dtype)
+    return [pair for pair, moved in zip(both, pixels.tolist(), strict=True) if moved <= SETTLED]
 
 
 def detect_keypoints(views: Sequence[View], features: Features) -> list[ImageKeypoints]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -29,6 +29,8 @@ LEAST_BASELINE = 1e-12
 
 CACHED = 2**18
 """Number of distances computed at a time, so that they stay in the processor's cache."""
+ROWS = 64
+"""Number of keypoints with successive epipolar lines that are compared at a time: their lines cover a few percent of an image."""
 NEARBY = 128
 """Number of nearest cameras among which an image is matched. On a drawn building of 320 rooms of 20 photos, half of the pairs show the
 same walls, as in a single room; among the nearest 500, or among all, fewer do."""
@@ -78,37 +80,48 @@ def epipolar_matches(a: ImageKeypoints, b: ImageKeypoints) -> PairMatches:
     if not n or not m:
         return PairMatches(torch.zeros((0, 2), dtype=torch.long), torch.zeros(0))
     x, y, lines = a.keypoints.descriptors.float(), b.keypoints.descriptors.float(), EpipolarLines.of(a, b)
-    x_squares, y_squares = x.square().sum(-1, keepdim=True), y.square().sum(-1)
+    x_squares, y_squares, blocks = x.square().sum(-1, keepdim=True), y.square().sum(-1), [*lines.blocks()]
+    pixels, reach = b.keypoints.pixels, (b.keypoints.sizes[:, None] / 2).clamp(min=4.0)
 
-    def distances(rows: Tensor) -> tuple[Float[Tensor, "r m"], Float[Tensor, "r m"]]:
-        """Return the squared distances of some keypoints of ``a`` to those of ``b``, and these near the lines only, else infinity."""
-        distance = torch.addmm(y_squares, x[rows], y.T, alpha=-2).add_(x_squares[rows])
-        return distance, torch.where(lines.near(rows), distance, torch.inf)
+    def distances(rows: Tensor, columns: Tensor | slice) -> Float[Tensor, "r c"]:
+        """Return the squared distances of keypoints of ``a`` to keypoints of ``b``."""
+        return torch.addmm(y_squares[columns], x[rows], y[columns].T, alpha=-2).add_(x_squares[rows])
 
-    # Blocks of rows stay in the processor's cache.
-    size = max(1, CACHED // m)
-    best, partner = torch.empty(n), torch.empty(n, dtype=torch.long)
+    def banded(rows: Tensor, columns: Tensor) -> Float[Tensor, "r c"]:
+        """Return the squared distances of keypoints near the lines, and infinity for others."""
+        return torch.where(lines.near(rows, columns), distances(rows, columns), torch.inf)
+
+    def next_best(distance: Float[Tensor, "r c"], rows: Tensor, columns: Tensor | slice) -> Float[Tensor, "r"]:
+        """Return the smallest distance of each keypoint to others than its partner and the partner's duplicates.
+
+        Duplicates do not make a match ambiguous: SIFT returns one keypoint for each dominant orientation, and keypoints within the
+        radius of a keypoint's neighbourhood also have similar descriptors.
+        """
+        exact = "donot_use_mm_for_euclid_dist"
+        away = torch.cdist(pixels[partner[rows]], pixels[columns], compute_mode=exact)
+        return distance.masked_fill_(away < reach[partner[rows]], torch.inf).amin(dim=1)
+
+    best, partner = torch.full((n,), torch.inf), torch.zeros(n, dtype=torch.long)
     least = torch.full((m,), torch.inf)
-    for rows in torch.arange(n).split(size):
-        banded = distances(rows)[1]
-        best[rows], partner[rows] = banded.min(1)
-        least = least.minimum(banded.amin(0))
-    mutual = ((best == least[partner]) & best.isfinite()).nonzero()[:, 0]
+    for rows, columns in blocks:
+        distance = banded(rows, columns)
+        best[rows], column = distance.min(1)
+        partner[rows] = columns[column]
+        least[columns] = least[columns].minimum(distance.amin(0))
+    mutual = (best == least[partner]) & best.isfinite()
     # Of keypoints with equal descriptors, the first one
-    first = torch.full((m,), n).scatter_reduce(0, partner[mutual], mutual, "amin")
-    mutual = mutual[first[partner[mutual]] == mutual]
-    good, ambiguity = torch.zeros(len(mutual), dtype=torch.bool), torch.zeros(len(mutual))
-    for some in torch.arange(len(mutual)).split(size):
-        rows, column = mutual[some], partner[mutual[some]]
-        distance, banded = distances(rows)
-        # Duplicates do not make a match ambiguous: SIFT returns one keypoint for each dominant orientation, and keypoints within the
-        # radius of a keypoint's neighbourhood also have similar descriptors.
-        reach = (b.keypoints.sizes[column, None] / 2).clamp(min=4.0)  # pixels
-        near = torch.cdist(b.keypoints.pixels[column], b.keypoints.pixels) < reach
-        next_best, next_in_band = (each.masked_fill_(near, torch.inf).amin(dim=1) for each in (distance, banded))
-        good[some] = (best[rows] < 0.85**2 * next_in_band) & (best[rows] < 0.95**2 * next_best)
-        ambiguity[some] = (best[rows] / next_best.clamp(min=1)).sqrt()
-    return PairMatches(torch.stack([mutual, partner[mutual]], dim=-1)[good], ambiguity[good])
+    numbers = mutual.nonzero()[:, 0]
+    first = torch.full((m,), n).scatter_reduce(0, partner[numbers], numbers, "amin")
+    mutual[numbers] = first[partner[numbers]] == numbers
+    for rows, columns in blocks:
+        rows = rows[mutual[rows]]
+        mutual[rows] = best[rows] < 0.85**2 * next_best(banded(rows, columns), rows, columns)
+    numbers, every = mutual.nonzero()[:, 0], slice(None)
+    others = [next_best(distances(rows, every), rows, every) for rows in numbers.split(max(1, CACHED // m))]
+    nearest, second = best[numbers], torch.cat(others)
+    good = nearest < 0.95**2 * second
+    ambiguity = (nearest / second.clamp(min=1)).sqrt()
+    return PairMatches(torch.stack([numbers, partner[numbers]], dim=-1)[good], ambiguity[good])
 
 
 def matches_of_points(
@@ -160,6 +173,7 @@ class EpipolarLines:
     least: Float[Tensor, "n 1"]  # of ``along``
     band: float
     seen: Float[Tensor, "3 m"]  # the keypoints of the image
+    epipole: Float[Tensor, "3"]  # unit length, float64
     coincide: bool
 
     @staticmethod
@@ -180,15 +194,46 @@ class EpipolarLines:
         )
         # If a ray points behind the other camera, its point at infinity has no projection, so the whole line is allowed.
         least = torch.where(front > 0, -band, -torch.inf).float()
-        coincide = float(torch.linalg.vector_norm(base)) < LEAST_BASELINE
-        return EpipolarLines(start.float(), across, along, least, band, seen, coincide)
+        distance = torch.linalg.vector_norm(base)
+        coincide = float(distance) < LEAST_BASELINE
+        return EpipolarLines(start.float(), across, along, least, band, seen, base / distance, coincide)
 
-    def near(self, rows: Int[Tensor, "r"]) -> Bool[Tensor, "r m"]:
-        """Return whether each keypoint of the image lies near the half-lines with the numbers ``rows``."""
+    def near(self, rows: Int[Tensor, "r"], columns: Int[Tensor, "c"] | slice = slice(None)) -> Bool[Tensor, "r c"]:
+        """Return whether the keypoints of the image with numbers ``columns`` lie near the half-lines with the numbers ``rows``."""
+        seen = self.seen[:, columns]
         if self.coincide:
-            return torch.cdist(self.start[rows], self.seen[:2].mT) <= self.band
-        near = (self.across[rows] @ self.seen).abs_() <= self.band
-        return near.logical_and_(self.along[rows] @ self.seen >= self.least[rows])
+            return torch.cdist(self.start[rows], seen[:2].mT) <= self.band
+        near = (self.across[rows] @ seen).abs_() <= self.band
+        return near.logical_and_(self.along[rows] @ seen >= self.least[rows])
+
+    def blocks(self) -> Iterator[tuple[Int[Tensor, "r"], Int[Tensor, "c"]]]:
+        """Yield blocks of half-lines, and the keypoints that may lie near any of them, in ascending order; both as numbers.
+
+        All lines pass through the epipole. Those that pass within the band of a keypoint have directions between the tangents from the
+        epipole to a disc about the keypoint. Directions are angles in a basis of the lines' plane, so that the epipole may be at infinity.
+        """
+        lines, points = torch.arange(len(self.start)), torch.arange(self.seen.shape[1])
+        if self.coincide:
+            for rows in lines.split(max(1, CACHED // len(points))):
+                yield rows, points
+            return
+        basis = torch.linalg.svd(self.epipole[None]).Vh[1:]  # of the lines through the epipole
+        u, v = basis @ self.seen.double()
+        gram = basis[:, :2] @ basis[:, :2].mT * (1.01 * self.band) ** 2
+        # A line (cos, sin) meets the disc where (u cos + v sin)^2 <= (its length in the image times the radius)^2.
+        mean = (u * u + v * v - gram.trace()) / 2
+        towards = torch.atan2(u * v - gram[0, 1], (u * u - v * v - gram[0, 0] + gram[1, 1]) / 2)
+        squared = u * u * gram[1, 1] + v * v * gram[0, 0] - 2 * u * v * gram[0, 1] - torch.det(gram)
+        reach = torch.where(squared > 0, torch.atan2(squared.clamp(min=0).sqrt(), mean) / 2, torch.pi / 2)
+        cosine, sine = basis @ self.across.double().mT
+        angle, order = torch.atan2(sine, cosine).remainder(torch.pi).sort()
+        for rows, angles in zip(order.split(ROWS), angle.split(ROWS), strict=True):
+            middle, half = (angles[0] + angles[-1]) / 2, (angles[-1] - angles[0]) / 2
+            # Differences of directions are between 0 and 90 degrees.
+            away = ((towards / 2 - middle).remainder(torch.pi) - torch.pi / 2).abs()
+            columns = points[away <= reach + half]
+            if len(columns):
+                yield rows, columns
 
 
 def link_tracks(matches: Sequence[tuple[int, int, PairMatches]], sizes: Sequence[int]) -> Int[Tensor, "m"]:
