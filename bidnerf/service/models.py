@@ -209,7 +209,7 @@ class LocalizationBody(BaseModel):
     backend: str
     error: None
     map: str = Field(ABSENT, description="of several maps, the one that the photo shows")
-    similarity: float = Field(ABSENT, description="of the photo and that map")
+    similarity: float = Field(ABSENT, description="share of the photo's voting keypoints that recognise that map")
     runner_up: dict[str, Any] | None = Field(ABSENT, description="the second best of several maps")
 
 

@@ -229,10 +229,13 @@ class LandmarkMatcher:
         """
         return self._cached_features or find_features(self.landmarks.features, "the detector of the map's landmarks")
 
-    def for_query(self) -> LandmarkMatcher:
-        """Return a matcher for one query, whose ``features`` cache the keypoints of each image; everything else is shared."""
+    def for_query(self, features: CachedFeatures | None = None) -> LandmarkMatcher:
+        """Return a matcher for one query, whose ``features`` cache the keypoints of each image; everything else is shared.
+
+        The matchers of several maps may share the ``features`` too, if their landmarks have the same detector.
+        """
         found = copy.copy(self)
-        found._cached_features = CachedFeatures(lambda rgb: detect(self.features, rgb))
+        found._cached_features = features or CachedFeatures(lambda rgb: detect(self.features, rgb))
         return found
 
     def nearest(self, descriptors: UInt8[Tensor, "q d"], count: int) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:

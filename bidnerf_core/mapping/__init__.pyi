@@ -52,7 +52,6 @@ from .landmarks.tracks import depth_ratio as depth_ratio
 from .landmarks.tracks import likely_pairs as likely_pairs
 from .landmarks.tracks import matches_of_points as matches_of_points
 from .landmarks.vocabulary import Vocabulary as Vocabulary
-from .landmarks.vocabulary import pool_views as pool_views
 from .resection.descend import CostTerm as CostTerm
 from .resection.descend import GaussianPrior as GaussianPrior
 from .resection.descend import Normal as Normal

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import functools
 import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
@@ -20,8 +20,8 @@ from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import USUAL_METHOD, Localization, Outcome, Verdict, localize_by_landmarks
-from bidnerf_core.mapping import LandmarkMap, Vocabulary, detect, find_features, pool_views
-from bidnerf_core.maps.description import cameras_of, load_info
+from bidnerf_core.mapping import CachedFeatures, DescriptorCells, InvertedFile, LandmarkMap, detect, find_features
+from bidnerf_core.maps.description import load_info
 from bidnerf_core.maps.description_file import DESCRIPTION
 from bidnerf_core.maps.localizer import Localizer
 from bidnerf_core.maps.map import Map, load_map
@@ -31,6 +31,13 @@ from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, cou
 
 _Scene = TypeVar("_Scene", bound=Map | str | Path)
 
+VOTERS, CANDIDATES = 150, 16
+"""Number of keypoints that vote for maps, and of landmarks that each compares."""
+CLEAR = 0.9
+"""Largest ratio of the distance to a landmark that a keypoint recognises and that to the last of its candidates."""
+RIVAL = 0.3
+"""Share of the votes of the best map with which another map may be the one that an image shows."""
+
 
 @dataclass(frozen=True, eq=False)
 class Placement:
@@ -39,7 +46,7 @@ class Placement:
     map: str  # the map of the best answer, even if that was refused
     found: Localization
     runner_up: tuple[str, Localization] | None  # the second best answer; None if only one map was tried
-    # all maps, most similar first: the cosine between pooled descriptors, -1 if a map has none
+    # all maps, most similar first: the share of the voting keypoints that recognise landmarks of it, -1 if a map has none
     ranking: Mapping[str, float]
     tried: tuple[str, ...]  # maps in which the image was localized, in order
     backend: str  # backend of the map's field
@@ -51,7 +58,7 @@ class Placement:
 
     def plain(self) -> dict[str, Any]:
         """Return the map, its similarity and the runner-up as JSON values."""
-        runner_up, similarity = None, {name: round(cosine, 4) for name, cosine in self.ranking.items()}
+        runner_up, similarity = None, {name: round(share, 4) for name, share in self.ranking.items()}
         if self.runner_up is not None:
             name, other = self.runner_up
             runner_up = {
@@ -63,12 +70,42 @@ class Placement:
         return {"map": self.map, "similarity": similarity[self.map], "runner_up": runner_up}
 
 
+@dataclass(frozen=True, eq=False)
+class Ballot:
+    """An index of the landmarks of several maps, by which the keypoints of an image vote for the maps that it may show."""
+
+    owner: Int[Tensor, "n"]  # number of each landmark's map
+    index: InvertedFile
+
+    @staticmethod
+    def of(descriptors: Sequence[UInt8[Tensor, "n d"]]) -> Ballot:
+        """Index the descriptors of each map's landmarks."""
+        joined = torch.cat([*descriptors])
+        owner = torch.arange(len(descriptors)).repeat_interleave(torch.tensor([*map(len, descriptors)]))
+        return Ballot(owner, InvertedFile(joined, DescriptorCells.of(joined)))
+
+    def shares(self, descriptors: UInt8[Tensor, "q d"], maps: int) -> Float[Tensor, "m"]:
+        """Return the share of some ``descriptors`` that vote for each of ``maps``.
+
+        A keypoint votes for all maps with a landmark about as similar to it as the nearest one, unless all of its candidates are: what
+        looks alike in many maps tells none from another, but two maps of one place are both right.
+        """
+        voters = torch.linspace(0, len(descriptors) - 1, min(len(descriptors), VOTERS)).long()
+        distance, landmark = self.index.nearest(descriptors[voters], min(CANDIDATES, len(self.owner)), cells=4)
+        alike = distance * CLEAR**2 <= distance[:, :1]
+        alike &= ~alike[:, -1:]
+        votes = torch.zeros((len(voters), maps), dtype=torch.bool)
+        row, column = alike.nonzero().unbind(-1)
+        votes[row, self.owner[landmark[row, column]]] = True
+        return votes.double().mean(0)
+
+
 class MapCollection:
     """Finds the map that an image shows, and the pose of the image in that map.
 
-    Maps are ranked by the similarity of pooled descriptors, and only the most similar are tried. Maps without
-    landmarks cannot be ranked; all of them are tried last. Recently used maps stay in memory. A collection must be
-    used from one thread only.
+    The keypoints of an image vote for the maps whose landmarks they recognise. The image is localized in the map with the most votes,
+    and in others only if these have many votes as well, or if it is refused. Maps without landmarks cannot be ranked; all of them are
+    tried last. Recently used maps stay in memory. A collection must be used from one thread only.
     """
 
     def __init__(
@@ -95,7 +132,7 @@ class MapCollection:
         self.method, self.config, self.limit = method, config, limit
         self._maps = _maps_by_name(scenes)
         self._given_localizers, self._device = localizers or {}, device
-        self._localizer = functools.lru_cache(maxsize=6)(self._load)  # this many maps stay in memory after use
+        self._localizer = lru_cache(maxsize=6)(self._load)  # this many maps stay in memory after use
         self._infos = {
             name: scene.info if isinstance(scene, Map) else load_info(scene) for name, scene in self._maps.items()
         }
@@ -108,17 +145,14 @@ class MapCollection:
                 if found is not None and len(found):
                     landmarks[name] = found.to("cpu")
                 count(number, len(self._maps))
-        # The detector and the length of the descriptors of each map with landmarks, a vocabulary for each pair of them, and
-        # the pooled descriptors of each map.
-        self._key = {name: (found.features, found.descriptors.shape[1]) for name, found in landmarks.items()}
-        self._vocabularies = {
-            key: Vocabulary.of([found.descriptors for name, found in landmarks.items() if self._key[name] == key])
-            for key in dict.fromkeys(self._key.values())
-        }
-        self._pooled_views = {
-            name: pool_views(self._vocabularies[self._key[name]], found, cameras_of(self._infos[name]))
-            for name, found in landmarks.items()
-        }
+        # The maps with landmarks by the detector and the length of their descriptors, and an index of each such group.
+        groups = dict[tuple[str, int], list[str]]()
+        for name, found in landmarks.items():
+            groups.setdefault((found.features, found.descriptors.shape[1]), []).append(name)
+        self._ballots = [
+            (features, channels, names, Ballot.of([landmarks[name].descriptors for name in names]))
+            for (features, channels), names in groups.items()
+        ]
         if bare := [name for name in self._maps if name not in landmarks]:
             log.info(f"{amount(len(bare), 'map')} without landmarks, tried last: {', '.join(bare)}")
 
@@ -150,36 +184,44 @@ class MapCollection:
         return Localizer(scene, self.method, self.config, warm_up=False)
 
     def rank(self, frame: Frame) -> dict[str, float]:
-        """Return the cosine similarity of an image to each map, most similar first; -1 where it cannot be computed."""
-        vectors: dict[tuple[str, int], Float[Tensor, "p"]] = {}
-        for key, vocabulary in self._vocabularies.items():
-            descriptors = detect(find_features(key[0]), frame.rgb).descriptors if frame.has_colour else None
-            if descriptors is not None and len(descriptors) and descriptors.shape[1] == key[1]:
-                vectors[key] = vocabulary.pool(descriptors)
+        """Return the share of an image's keypoints that vote for each map, most votes first; -1 where it cannot be computed."""
+        return self._rank(frame, {})
+
+    def _rank(self, frame: Frame, detectors: dict[str, CachedFeatures]) -> dict[str, float]:
+        """Return the shares of the votes, and store the detectors, which know the image's keypoints, by name."""
         found = dict.fromkeys(self._maps, -1.0)
-        for name, own in self._key.items():
-            if own in vectors:
-                found[name] = float((self._pooled_views[name] @ vectors[own]).max())
+        for features, channels, names, ballot in self._ballots if frame.has_colour else ():
+            detector = detectors.setdefault(features, CachedFeatures(partial(detect, find_features(features))))
+            descriptors = detector(frame.rgb_bytes).descriptors
+            if len(descriptors) and descriptors.shape[1] == channels:
+                found |= zip(names, ballot.shares(descriptors, len(names)).tolist(), strict=True)
         return dict(sorted(found.items(), key=lambda item: -item[1]))
 
     def __call__(self, frame: Frame, seed: int = 0) -> Placement:
         """Find the map that a frame shows, and the pose of the frame in that map.
 
-        The frame is localized with the landmarks of the most similar maps in turn until one map accepts it, and
-        then in one more map, as a possible runner-up. The full method then localizes the frame in the best of
-        the maps tried: among those that accept it, or among all if none does, the one with the most inliers.
+        If one map has far more votes than all others, the frame is localized there, and that is the answer unless it is refused.
+        Otherwise, the frame is localized with the landmarks of the most similar maps in turn until one map accepts it, and then in one
+        more map, as a possible runner-up. The full method then localizes the frame in the best of the maps tried: among those that accept
+        it, or among all if none does, the one with the most inliers.
         Raises ``InputError`` for a frame that cannot be localized at all.
         """
-        ranking = self.rank(frame)
-        quick: dict[str, Localization] = {}
-        compared = [name for name, similarity in ranking.items() if similarity > -1.0]
+        detectors = dict[str, CachedFeatures]()
+        ranking = self._rank(frame, detectors)
+        compared = [name for name, share in ranking.items() if share > -1.0]
+        full, quick = dict[str, Localization](), dict[str, Localization]()
+        if len(compared) > 1 and ranking[compared[1]] < RIVAL * ranking[compared[0]]:
+            best = compared[0]
+            full[best] = found = self._in_map(best, frame, seed, detectors)
+            if found.converged:
+                return Placement(best, found, None, ranking, (best,), self._infos[best].backend)
         for name in [*compared[: self.limit], *(name for name in ranking if name not in compared)]:
             recognised = any(found.converged for found in quick.values())
-            quick[name] = self._by_landmarks(name, frame, seed)
+            quick[name] = full[name] if name in full else self._in_map(name, frame, seed, detectors, quick=True)
             if recognised:
                 break
         chosen = max(quick, key=lambda name: _merit(quick[name]))  # the first of equal ones
-        found = self.localizer(chosen)(frame, seed=seed)
+        found = full[chosen] if chosen in full else self._in_map(chosen, frame, seed, detectors)
         second = max([name for name in quick if name != chosen], key=lambda name: _merit(quick[name]), default=None)
         return Placement(
             chosen,
@@ -190,16 +232,21 @@ class MapCollection:
             self._infos[chosen].backend,
         )
 
-    def _by_landmarks(self, name: str, frame: Frame, seed: int) -> Localization:
-        """Localize a frame with the landmarks of a map.
+    def _in_map(
+        self, name: str, frame: Frame, seed: int, detectors: Mapping[str, CachedFeatures], quick: bool = False
+    ) -> Localization:
+        """Localize a frame in a map by the full method or, if ``quick``, by the landmarks of a map that has some.
 
-        The full method is used instead for maps without landmarks, and for methods that do not match landmarks.
+        Methods that do not match landmarks are used in full. What the ``detectors`` have found is not detected again.
         """
         localizer = self.localizer(name)
+        problem = localizer.problem(frame)
+        if problem.matcher is not None and (known := detectors.get(problem.matcher.landmarks.features)) is not None:
+            problem = replace(problem, matcher=problem.matcher.for_query(known))
+        if not quick or not localizer.matches_landmarks:
+            return localizer.answer(problem, seed)
         try:
-            if not localizer.matches_landmarks:
-                return localizer(frame, seed=seed)
-            found = localize_by_landmarks(localizer.problem(frame), getattr(localizer.config, "fused_rays", 0), seed)
+            found = localize_by_landmarks(problem, getattr(localizer.config, "fused_rays", 0), seed)
         except InputError as error:  # such as a map without a surface
             why, losses = Verdict(Outcome.TOO_FEW_MATCHES, str(error)), torch.zeros(0, dtype=torch.float64)
             return Localization.of(why, SE3.unknown()[None], losses, self.method, time.perf_counter(), math.nan)

@@ -119,8 +119,11 @@ class Localizer:
             require_fit(self.method, lambda used: used.uses_depth, "uses colour alone, got depth points; use method")
         origin = origin_of(self.scene)
         near = None if start is None else start_pose(start).translated(-origin)
-        problem = self.problem(query, near, depth_rays)
-        frame = problem.views[-1].frame
+        return self.answer(self.problem(query, near, depth_rays), seed)
+
+    def answer(self, problem: Problem, seed: int = 0) -> Localization:
+        """Solve a ``problem`` created by this localizer, as ``__call__`` does: the pose is in the world, and a notebook shows the answer."""
+        frame, origin = problem.views[-1].frame, origin_of(self.scene)
         found = replace(self.solve(problem, seed).translated(origin), name=frame.name)
         # Every n-th pixel, at most 240 along the longer side, since each rendered pixel takes time.
         step = -(-max(frame.intrinsics.width, frame.intrinsics.height) // 240)
