@@ -46,12 +46,19 @@ def sum_by(values: Tensor, index: Tensor, count: int) -> Tensor:
     return torch.zeros((count, *values.shape[1:]), dtype=values.dtype).index_add_(0, index, values)
 
 
+BLOCK = 2**16
+"""Number of observations whose matrices are computed at a time, which bounds the memory."""
+
+
 def triangulate(sightings: Sightings, count: int) -> Float[Tensor, "n 3"]:
     """Triangulate ``count`` points: return the position (metres, world) nearest to all rays of each, by linear least squares."""
-    d = sightings.directions()
-    across = torch.eye(3, dtype=d.dtype) - d[:, :, None] * d[:, None]
-    matrix = sum_by(across, sightings.point, count)
-    right = sum_by((across @ sightings.centre[..., None])[..., 0], sightings.point, count)
+    matrix, right = (torch.zeros((count, 3, *more), dtype=torch.float64) for more in ((3,), ()))
+    for first in range(0, len(sightings), BLOCK):
+        some = sightings[first : first + BLOCK]
+        d = some.directions()
+        across = torch.eye(3, dtype=d.dtype) - d[:, :, None] * d[:, None]
+        matrix.index_add_(0, some.point, across)
+        right.index_add_(0, some.point, (across @ some.centre[..., None])[..., 0])
     return torch.linalg.solve(damp(matrix), right)
 
 
@@ -73,13 +80,17 @@ def refine_points(
 def _normal_equations(
     sightings: Sightings, points: Float[Tensor, "n 3"], scale: float
 ) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3"]]:
-    flat, depth, front = pinhole(sightings.in_camera(points))
-    residual = (flat - sightings.image) * sightings.focal[:, None]
-    weight = front * inlier_weight(residual.square().sum(-1), scale)
-    jacobian = by_camera_point(flat, depth / sightings.focal) @ sightings.rotation
-    weighted = jacobian.mT * weight[:, None, None]
-    matrix = sum_by(weighted @ jacobian, sightings.point, len(points))
-    return matrix, sum_by((weighted @ residual[..., None])[..., 0], sightings.point, len(points))
+    matrix, gradient = (torch.zeros((len(points), 3, *more), dtype=torch.float64) for more in ((3,), ()))
+    for first in range(0, len(sightings), BLOCK):
+        some = sightings[first : first + BLOCK]
+        flat, depth, front = pinhole(some.in_camera(points))
+        residual = (flat - some.image) * some.focal[:, None]
+        weight = front * inlier_weight(residual.square().sum(-1), scale)
+        jacobian = by_camera_point(flat, depth / some.focal) @ some.rotation
+        weighted = jacobian.mT * weight[:, None, None]
+        matrix.index_add_(0, some.point, weighted @ jacobian)
+        gradient.index_add_(0, some.point, (weighted @ residual[..., None])[..., 0])
+    return matrix, gradient
 
 
 def parallax(sightings: Sightings, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -253,13 +254,15 @@ def link_tracks(matches: Sequence[tuple[int, int, PairMatches]], sizes: Sequence
     matched, ends = np.unique(ends, return_inverse=True)
     ends = ends.reshape(-1, 2)
     image = np.searchsorted(first, matched, side="right") - 1
-    parent, images = list(range(len(matched))), [{number} for number in image.tolist()]
-    for a, b in ends[np.argsort(ambiguity, kind="stable")].tolist():
-        small, large = sorted((_root(parent, a), _root(parent, b)), key=lambda root: len(images[root]))
-        if small != large and images[small].isdisjoint(images[large]):
-            parent[small] = large
-            images[large] |= images[small]
-            images[small] = images[large]
+    # Tuples take a quarter of the memory of sets, and lists of all matches at once would take most of it.
+    parent, images = list(range(len(matched))), [(number,) for number in image.tolist()]
+    ends = ends[np.argsort(ambiguity, kind="stable")]
+    for begin in range(0, len(ends), MANY):
+        for a, b in ends[begin : begin + MANY].tolist():
+            small, large = sorted((_root(parent, a), _root(parent, b)), key=lambda root: len(images[root]))
+            if small != large and set(images[small]).isdisjoint(images[large]):
+                parent[small] = large
+                images[large], images[small] = images[large] + images[small], ()
     label = np.arange(first[-1])
     label[matched] = matched[[_root(parent, number) for number in range(len(matched))]]
     return torch.from_numpy(label)
@@ -279,7 +282,7 @@ class TrackedKeypoints:
 
     images: Sequence[ImageKeypoints]  # with poses T_world_camera
     point: Int[Tensor, "m"]
-    number: Int[Tensor, "m"]  # of the keypoint
+    number: Int[Tensor, "m"]  # of the keypoint, ascending
 
     def __getitem__(self, index: Tensor) -> TrackedKeypoints:
         return TrackedKeypoints(self.images, self.point[index], self.number[index])
@@ -319,8 +322,14 @@ class TrackedKeypoints:
     @property
     def keypoints(self) -> Keypoints:
         """The keypoints, in the images in which they were detected."""
-        pixels, sizes, descriptors = zip(*(vars(image.keypoints).values() for image in self.images), strict=True)
-        return Keypoints(torch.cat(pixels), torch.cat(sizes), torch.cat(descriptors))[self.number]
+        first = torch.tensor([0, *(len(image.keypoints) for image in self.images)]).cumsum(0)
+        bounds = torch.searchsorted(self.number, first).tolist()
+        chosen = [
+            image.keypoints[self.number[begin:end] - start]
+            for image, start, (begin, end) in zip(self.images, first.tolist(), pairwise(bounds), strict=False)
+        ]
+        pixels, sizes, descriptors = zip(*(vars(some).values() for some in chosen), strict=True)
+        return Keypoints(torch.cat(pixels), torch.cat(sizes), torch.cat(descriptors))
 
     @property
     def depth(self) -> Float[Tensor, "m"]:
@@ -382,9 +391,11 @@ def _mean_descriptors(descriptors: UInt8[Tensor, "m d"], point: Int[Tensor, "m"]
         total.index_add_(0, point[rows], values)
         lengths.index_add_(0, point[rows], torch.linalg.vector_norm(values, dim=-1, keepdim=True))
     number = torch.bincount(point, minlength=count).clamp(min=1)[:, None]
-    mean, length = total / number, lengths / number
-    scaled = mean * length / torch.linalg.vector_norm(mean, dim=-1, keepdim=True).clamp(min=1e-9)
-    return (scaled + zero).round().clamp(0, 255).to(torch.uint8)
+    total /= number  # the mean; in place, as it takes much memory
+    norm = torch.linalg.vector_norm(total, dim=-1, keepdim=True).clamp(min=1e-9)
+    total *= lengths / number
+    total /= norm
+    return total.add_(zero).round_().clamp_(0, 255).to(torch.uint8)
 
 
 ENOUGH_DEPTHS = 30
