@@ -126,7 +126,8 @@ class LandmarkConfig(Settings):
     # minimum angle between the rays of a point, degrees; below it, the point is placed by measured depth
     parallax: Annotated[float, Above(0.0, 89.0)] = 2.0
     singles: bool = True  # make landmarks of keypoints seen in a single image if their depth was measured
-    most: Annotated[int, Range(1, 10**8)] = 200_000  # maximum number of landmarks, 168 bytes each with SIFT
+    # maximum number of landmarks, 168 bytes each with SIFT, of up to 1,000 images; of more images, in proportion
+    most: Annotated[int, Range(1, 10**8)] = 200_000
 
 
 DEFAULT_LANDMARKS = LandmarkConfig()
@@ -173,9 +174,10 @@ class TrackedViews:
         moving = float((self.observations.motion != 0).any(1).double().mean())
         usual = USUAL_FEATURES if isinstance(self.features, Sift) else ""
         name = self.features if isinstance(self.features, str) else usual
-        if len(landmarks) > config.most:
-            report(f"{len(landmarks)} landmarks found, {config.most} kept: those seen in the most images")
-            landmarks = landmarks[landmarks.views.argsort(descending=True, stable=True)[: config.most].sort().values]
+        most = round(config.most * max(1.0, len(self.observations.images) / 1000))
+        if len(landmarks) > most:
+            report(f"{len(landmarks)} landmarks found, {most} kept: those seen in the most images")
+            landmarks = landmarks[landmarks.views.argsort(descending=True, stable=True)[:most].sort().values]
         return replace(landmarks, moving=moving, features=name).indexed()
 
     def landmarks_by_image(self, config: LandmarkConfig) -> list[SeenLandmarks]:
