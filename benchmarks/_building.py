@@ -13,17 +13,16 @@ from pathlib import Path
 from typing import overload
 
 import torch
-from torch import Generator
+from torch import Generator, Tensor
 
 import bidnerf.scenes
 import bidnerf_core.mapping
-from bidnerf.scenes import ClosedFormScene, Primitive, Texture, blotches, box, look_around
-from bidnerf.scenes.primitives import Faces
+from bidnerf.scenes import ClosedFormScene, Faces, Primitive, Texture, blotches, box, look_around
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.mapping import ImageKeypoints, Keypoints, Sift, detect_keypoints
+from bidnerf_core.mapping import SIFT, Keypoints, detect_keypoints
 
 ROOMS, PHOTOS = 320, 20
 """Number of rooms, and of photos of each."""
@@ -137,19 +136,38 @@ def folder_of_keypoints(cache: Path) -> Path:
     return cache / f"building-{hashed.hexdigest()}"
 
 
-def keypoints_of(count: int, folder: Path) -> list[ImageKeypoints]:
+def keypoints_of(count: int, folder: Path) -> list[Keypoints]:
     """Return the keypoints of the first photos, which ``folder`` keeps: a file of each room."""
     folder.mkdir(parents=True, exist_ok=True)
-    views, found = Photos(count), list[ImageKeypoints]()
+    views, found = Photos(count), list[Keypoints]()
     for room in range(count // PHOTOS):
-        file, own = folder / f"{room}.pt", range(room * PHOTOS, (room + 1) * PHOTOS)
+        file = folder / f"{room}.pt"
         if not file.exists():
-            detections = [image.keypoints for image in detect_keypoints([views[number] for number in own], Sift())]
-            partial_file = file.with_suffix(".part")
-            torch.save([(k.pixels, k.sizes, k.descriptors) for k in detections], partial_file)
-            partial_file.rename(file)
-        for number, parts in zip(own, torch.load(file), strict=True):
-            keypoints, T = Keypoints(*parts), views.poses[number]
-            depth = torch.zeros(len(keypoints), dtype=torch.float64)
-            found.append(ImageKeypoints(keypoints, CAMERA.unproject(keypoints.pixels.double()), depth, CAMERA, T))
+            own = [views[number] for number in range(room * PHOTOS, (room + 1) * PHOTOS)]
+            detections = [image.keypoints for image in detect_keypoints(own, SIFT)]
+            torch.save([(k.pixels, k.sizes, k.descriptors) for k in detections], file.with_suffix(".part"))
+            file.with_suffix(".part").rename(file)
+        found += [Keypoints(*parts) for parts in torch.load(file)]
+    return found
+
+
+class StoredKeypoints:
+    """A detector of images that show their number, see ``numbered``."""
+
+    takes_bytes = True
+
+    def __init__(self, keypoints: Sequence[Keypoints]) -> None:
+        self.keypoints = keypoints
+
+    def __call__(self, rgb: Tensor) -> Keypoints:
+        high, middle, low = rgb[0, 0].tolist()
+        return self.keypoints[65_536 * high + 256 * middle + low]
+
+
+def numbered(photos: Photos) -> list[View]:
+    """Return views with the poses of photos, each of whose pixels is the number of the photo."""
+    found = []
+    for number, T in enumerate(photos.poses):
+        pixel = torch.tensor([number // 65_536, number // 256 % 256, number % 256], dtype=torch.uint8)
+        found.append(View(Frame(f"{number:04d}", pixel.expand(CAMERA.height, CAMERA.width, 3), CAMERA), T))
     return found

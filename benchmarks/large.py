@@ -27,25 +27,34 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
-from _building import CAMERA, PHOTOS, Photos, bounds_of, folder_of_keypoints, keypoints_of, photo, poses_in
+from _building import (
+    PHOTOS,
+    Photos,
+    StoredKeypoints,
+    bounds_of,
+    folder_of_keypoints,
+    keypoints_of,
+    numbered,
+    photo,
+    poses_in,
+)
 from _lab import RESULTS, Row, RowStore, Scene, answer, capture_of, one_thread, parser, record, within, without_depth
 
 from bidnerf import SE3, Localizer, Map, MapCollection, load_map
 from bidnerf.results import success_rate
-from bidnerf_core.captures import stored_cameras, tried_landmarks
-from bidnerf_core.captures.trial import held_out_images
+from bidnerf_core.captures import held_out_images, stored_cameras, tried_landmarks
 from bidnerf_core.fields import NoField, SceneBounds
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.frames import View
 from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
     SIFT,
+    USUAL_FEATURES,
     LandmarkMap,
-    TrackedKeypoints,
-    TrackedViews,
     Tracks,
     concatenate,
     detect_keypoints,
     likely_pairs,
+    track_views,
 )
 from bidnerf_core.maps import MapInfo
 
@@ -197,11 +206,10 @@ def build(count: int, keypoints: Path, folder: Path) -> Row:
     one_thread()
     photos, images = Photos(count), keypoints_of(count, keypoints)
     _ = [photos[number] for number in held_out_images(count)]  # are rendered now
-    total = sum(len(image.keypoints) for image in images)
-    untracked = TrackedViews(TrackedKeypoints(images, torch.arange(total), torch.arange(total)), "sift")
-    config, rows = DEFAULT_LANDMARKS, dict[str, Row]()
+    views, config, rows = numbered(photos), DEFAULT_LANDMARKS, dict[str, Row]()
     pairs, rows["pairs"] = measured(lambda: likely_pairs(photos.poses, config.neighbours))
-    tracked, rows["matches and tracks"] = measured(lambda: untracked.rematch(config))
+    tracked, rows["matches and tracks"] = measured(lambda: track_views(views, StoredKeypoints(images)))
+    tracked = replace(tracked, features=USUAL_FEATURES)
     _, rows["landmarks"] = measured(lambda: tracked.landmarks(config))
     landmarks, rows["trial"] = measured(lambda: tried_landmarks(tracked, photos, config))
     # Matching chooses the pairs again, and a trial builds the landmarks before.
@@ -209,14 +217,12 @@ def build(count: int, keypoints: Path, folder: Path) -> Row:
     rows["matches and tracks"]["cpu_seconds"] -= rows["pairs"]["cpu_seconds"]
     rows["trial"]["cpu_seconds"] -= rows["landmarks"]["cpu_seconds"]
     lower, upper = bounds_of(0).lower, bounds_of(count // PHOTOS - 1).upper
-    blank = torch.zeros((1, 1, 3), dtype=torch.uint8).expand(CAMERA.height, CAMERA.width, 3)
-    views = [View(Frame(f"{number:04d}", blank, CAMERA), T) for number, T in enumerate(photos.poses)]
     bounds = SceneBounds(lower, upper, 0.05, 2 * math.dist(lower, upper))
     info = MapInfo("", {}, bounds, 0, True, "building", cameras=stored_cameras(views), unit="metres")
     Map(info, NoField(), None, landmarks).save(folder, overwrite=True)
     return {
         "photos": count,
-        "keypoints": total,
+        "keypoints": sum(map(len, images)),
         "pairs": len(pairs),
         "landmarks": len(landmarks),
         "cpu_seconds_a_photo": whole / count,

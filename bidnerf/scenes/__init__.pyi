@@ -9,6 +9,7 @@ from .demo import demo_object as demo_object
 from .demo import demo_room as demo_room
 from .fields import GaussianBlobs as GaussianBlobs
 from .fields import MovedField as MovedField
+from .primitives import Faces as Faces
 from .primitives import Primitive as Primitive
 from .primitives import Shape as Shape
 from .primitives import Texture as Texture

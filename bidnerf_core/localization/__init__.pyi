@@ -17,6 +17,7 @@ from .explanations import CAMERAS as CAMERAS
 from .loop import HEAVY_TAILS as HEAVY_TAILS
 from .loop import LandmarkAnswer as LandmarkAnswer
 from .loop import Loop as Loop
+from .matching import VOTERS as VOTERS
 from .matching import LandmarkMatcher as LandmarkMatcher
 from .methods import METHODS as METHODS
 from .methods import USUAL_METHOD as USUAL_METHOD

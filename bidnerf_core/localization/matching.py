@@ -134,7 +134,7 @@ def cells(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Int[Tensor, "m"]:
 MANY_LANDMARKS = 100_000
 """Number of landmarks above which a query is first matched with those of the images most similar to it."""
 VOTERS, LEAST_VOTES = 150, 5
-"""Number of keypoints that vote for images, and of votes without which no image counts as similar."""
+"""Number of keypoints that vote for images or for maps, and of votes without which no image counts as similar."""
 
 
 @lru_cache(maxsize=1)

@@ -19,7 +19,7 @@ from bidnerf_core.datasets import unique_names
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization import USUAL_METHOD, Localization, Outcome, Verdict, localize_by_landmarks
+from bidnerf_core.localization import USUAL_METHOD, VOTERS, Localization, Outcome, Verdict, localize_by_landmarks
 from bidnerf_core.mapping import CachedFeatures, DescriptorCells, InvertedFile, LandmarkMap, detect, find_features
 from bidnerf_core.maps.description import load_info
 from bidnerf_core.maps.description_file import DESCRIPTION
@@ -31,8 +31,8 @@ from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, cou
 
 _Scene = TypeVar("_Scene", bound=Map | str | Path)
 
-VOTERS, CANDIDATES = 150, 16
-"""Number of keypoints that vote for maps, and of landmarks that each compares."""
+CANDIDATES = 16
+"""Number of landmarks that a keypoint that votes for maps compares."""
 CLEAR = 0.9
 """Largest ratio of the distance to a landmark that a keypoint recognises and that to the last of its candidates."""
 RIVAL = 0.3

@@ -46,15 +46,15 @@ def sum_by(values: Tensor, index: Tensor, count: int) -> Tensor:
     return torch.zeros((count, *values.shape[1:]), dtype=values.dtype).index_add_(0, index, values)
 
 
-BLOCK = 2**16
+AT_ONCE = 2**16
 """Number of observations whose matrices are computed at a time, which bounds the memory."""
 
 
 def triangulate(sightings: Sightings, count: int) -> Float[Tensor, "n 3"]:
     """Triangulate ``count`` points: return the position (metres, world) nearest to all rays of each, by linear least squares."""
     matrix, right = (torch.zeros((count, 3, *more), dtype=torch.float64) for more in ((3,), ()))
-    for first in range(0, len(sightings), BLOCK):
-        some = sightings[first : first + BLOCK]
+    for first in range(0, len(sightings), AT_ONCE):
+        some = sightings[first : first + AT_ONCE]
         d = some.directions()
         across = torch.eye(3, dtype=d.dtype) - d[:, :, None] * d[:, None]
         matrix.index_add_(0, some.point, across)
@@ -81,8 +81,8 @@ def _normal_equations(
     sightings: Sightings, points: Float[Tensor, "n 3"], scale: float
 ) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3"]]:
     matrix, gradient = (torch.zeros((len(points), 3, *more), dtype=torch.float64) for more in ((3,), ()))
-    for first in range(0, len(sightings), BLOCK):
-        some = sightings[first : first + BLOCK]
+    for first in range(0, len(sightings), AT_ONCE):
+        some = sightings[first : first + AT_ONCE]
         flat, depth, front = pinhole(some.in_camera(points))
         residual = (flat - some.image) * some.focal[:, None]
         weight = front * inlier_weight(residual.square().sum(-1), scale)

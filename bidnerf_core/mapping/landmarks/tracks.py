@@ -255,7 +255,7 @@ def link_tracks(matches: Sequence[tuple[int, int, PairMatches]], sizes: Sequence
     ends = ends.reshape(-1, 2)
     image = np.searchsorted(first, matched, side="right") - 1
     # Tuples take a quarter of the memory of sets, and lists of all matches at once would take most of it.
-    parent, images = list(range(len(matched))), [(number,) for number in image.tolist()]
+    parent, images = list(range(len(matched))), list[tuple[int, ...]](zip(image.tolist()))
     ends = ends[np.argsort(ambiguity, kind="stable")]
     for begin in range(0, len(ends), MANY):
         for a, b in ends[begin : begin + MANY].tolist():
