@@ -29,6 +29,9 @@ LARGEST_SEED = 2**31 - 1
 WIDEST_HFOV = 170.0
 """Largest horizontal field of view (degrees): beyond it, the inner half of the angles fills less than 1/12 of a pinhole image."""
 
+FARTHEST = 1e9
+"""Largest depth (metres) that counts as measured: no sensor reaches farther."""
+
 
 class Allowed(Container[object]):
     """An annotation that limits a setting to the values in it; ``str()`` describes them for messages and help pages."""

@@ -4,9 +4,9 @@ from .options import MapFolder as MapFolder
 from .output import print_json as print_json
 from .output import say as say
 from .output import show as show
-from .parser import Flag as Flag
-from .parser import Group as Group
-from .parser import Option as Option
+from .parameters import Flag as Flag
+from .parameters import Group as Group
+from .parameters import Option as Option
 from .program import COMMANDS as COMMANDS
 from .program import main as main
 from .running import display_progress as display_progress

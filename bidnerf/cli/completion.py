@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from bidnerf.cli.output import print_result
-from bidnerf.cli.parser import Option, SettingsGroup, leaves
+from bidnerf.cli.parameters import Option, SettingsGroup, leaves
 from bidnerf.cli.program import COMMANDS
 
 BASH = """_bidnerf() {{

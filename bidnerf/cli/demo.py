@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from bidnerf.cli.options import Overwrite, Seed, installed, wrong_usage
 from bidnerf.cli.output import console, print_table, say, show
-from bidnerf.cli.parser import Option
-from bidnerf.cli.running import interruptible_work, report_time
+from bidnerf.cli.parameters import Option
+from bidnerf.cli.running import explained_interruption, interruptible_work, report_time
 from bidnerf_core.registry import USUAL_BACKEND
 from bidnerf_core.settings import EXPERT, WholeNumbers
 
@@ -51,14 +51,14 @@ def run_demo(
     if steps is not None:
         with wrong_usage():
             config = from_flat(config, {"steps": steps}, f"backend {backend!r}")
-    with output_folder(out, overwrite):
+    stopped = f"stopped; the demo cannot be continued, 'bidnerf demo --out {out} --overwrite' starts again"
+    with output_folder(out, overwrite), explained_interruption(lambda: stopped):
         scene, camera = demo_object(), Intrinsics(350.0, 350.0, 128.0, 128.0, 256, 256)
         say(f"drawing a toy lorry from {TRAINING_VIEWS} poses, and from {frames} others that training will not see")
         seen = views(scene, camera, orbit(3.5, TRAINING_VIEWS, seed=seed))
         unseen = views(scene, camera, orbit(3.5, frames, elevation=(15.0, 50.0), seed=seed + 1))
         write_transforms(out / "data", {"train": seen, "test": unseen}, scene.bounds.background)
         options = TrainOptions(DatasetOptions(background=scene.bounds.background), overwrite=True)
-        stopped = f"stopped; the demo cannot be continued, 'bidnerf demo --out {out} --overwrite' starts again"
         with report_time(f"made a map from the {len(seen)} images"), interruptible_work(kept=stopped):
             stored = train(out / "data", backend, out / "map", config, options=options)
         say(f"finding the poses of the {frames} others without a start (auto), and of the first from a start (bid)")

@@ -12,6 +12,7 @@ from urllib.parse import quote
 from bidnerf.cli.options import (
     TEST_IMAGES,
     DaskAddress,
+    First,
     FrameNames,
     MethodGroup,
     MethodOptions,
@@ -19,11 +20,14 @@ from bidnerf.cli.options import (
     NoDepth,
     RunOptions,
     SeenImages,
+    existing,
     require_device,
+    require_inputs,
+    require_map,
     wrong_usage,
 )
-from bidnerf.cli.output import check_folder, console, print_result, require_outside_maps, say
-from bidnerf.cli.parser import Group, Option, Without
+from bidnerf.cli.output import check_folder, check_output, console, print_result, say
+from bidnerf.cli.parameters import Check, Group, Option, Without
 from bidnerf.cli.running import display_progress, interruptible_work
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, amount
@@ -64,6 +68,7 @@ class TrialOptions:
         int | None, EXPERT, WholeNumbers(0, LARGEST_SEED), Option("N", "seed of every random choice", "the protocol's")
     ] = None
     frame: FrameNames = ()
+    first: First = None
     no_depth: NoDepth = False
     fault: Annotated[
         Names,
@@ -77,23 +82,25 @@ class TrialOptions:
 
     def plan(self, method: MethodOptions, images: DatasetOptions, **more: Any) -> Plan:
         """Return the plan of the trials; ``more`` holds the fields of the plan that these options do not set."""
-        from bidnerf.evaluation import Plan
-        from bidnerf_core.localization import find_method
-
-        _ = images.mask_folder  # raises for anything but a folder of masks
         try:
             numbers = [[float(number) for number in size.split(":")] for size in self.size]
         except ValueError as error:
             raise UsageError(f"--size is {' '.join(self.size)}", expected="numbers such as 0.5, or 0.2:10") from error
+
+        from bidnerf.evaluation import Plan
+        from bidnerf_core.localization import find_method
+
+        _ = images.mask_folder  # raises for anything but a folder of masks
         with wrong_usage():
             return Plan(
                 protocol=self.protocol or ("bid" if find_method(method.method).needs_start else "none"),
                 sizes=numbers or None,
                 method=method.method,
-                config=method.config,
+                config=method.config(),
                 trials=self.trials,
                 seed=self.seed,
                 frames=self.frame or None,
+                first=self.first,
                 images=replace(images, register_depth=images.registration),
                 **more,
             )
@@ -117,7 +124,7 @@ class WorkOptions(RunOptions):
 
 
 def run_evaluate(
-    map: Annotated[str, Option("MAP", "folder of a map, or demo:blobs", positional=True)],
+    map: Annotated[str, Option("MAP", "folder of a map, or demo:blobs", positional=True), Check(require_map)],
     out: Annotated[Path, Option("RESULTS.jsonl", "results file; trials already in it are not run again")],
     data: Annotated[
         str | None,
@@ -127,6 +134,7 @@ def run_evaluate(
             "the scene of a demo: MAP",
             positional=True,
         ),
+        existing("a dataset"),
     ] = None,
     *,
     starts: Starts,
@@ -139,14 +147,13 @@ def run_evaluate(
     Trials begin at perturbed starts, or without a start. Finished trials are always kept: the same command resumes where it stopped.
     'bidnerf report' makes tables and figures from the results.
     """
-    from bidnerf.evaluation import evaluate
-
     if data is None and not map.startswith("demo:"):
         raise UsageError(f"no DATA after map {map}; only closed-form maps have their own data")
     if work.dask is not None and work.workers is not None:
         raise UsageError("--workers and --dask contradict each other: a cluster has its own workers")
     if work.dask is not None:
         import_extra("distributed", "cluster", "a cluster")  # before the map is loaded
+    check_output(out, (), overwrite=True)  # finished trials are kept
     plan = starts.plan(
         method,
         images,
@@ -155,7 +162,9 @@ def run_evaluate(
         faults=starts.fault,
     )
     require_device(work.device)
-    require_outside_maps(out.parent, out)
+
+    from bidnerf.evaluation import evaluate
+
     with interruptible_work("waiting for the trials under way (Ctrl-C again: at once)"):
         table = evaluate(map, data or map, plan, out=out, workers=work.dask or work.workers)
     lines = [f"{amount(len(table.rows), 'trial')} in {out}; 'bidnerf report {out}' shows them"]
@@ -203,14 +212,18 @@ def run_compare(
             f"{len(folders)} folder{'s' if len(folders) != 1 else ''} given",
             expected="the folders of one or more maps, then that of a dataset",
         )
+    *maps, data = folders
+    require_inputs(data, expected="the folder of a dataset, after those of the maps")
+    for map in maps:
+        require_map(map)
+    if out is not None:
+        check_folder(out, folders)
+    plan = replace(starts, size=() if size is None else (size,)).plan(method, images, device=run.device)
+    require_device(run.device)
+
     from bidnerf.evaluation import compare, comparison_figure
     from bidnerf_core.io import output_folder, to_plain
 
-    *maps, data = folders
-    require_device(run.device)
-    plan = replace(starts, size=() if size is None else (size,)).plan(method, images, device=run.device)
-    if out is not None:
-        check_folder(out, folders)
     with nullcontext() if out is None else output_folder(out, run.overwrite), display_progress():
         comparison = compare(maps, data, plan)
         if out is not None:
@@ -223,7 +236,11 @@ def run_compare(
 
 
 def run_report(
-    results: Annotated[tuple[Path, ...], Option("RESULTS...", "files written by 'bidnerf evaluate'", positional=True)],
+    results: Annotated[
+        tuple[Path, ...],
+        Option("RESULTS...", "files written by 'bidnerf evaluate'", positional=True),
+        Check(lambda files: require_inputs(*files, expected="lines as written by 'bidnerf evaluate'")),
+    ],
     out: Annotated[Path, Option("DIR", "folder for index.html and the figures as PNG and SVG")] = Path("report"),
     criterion: Annotated[
         Literal["10%", "5deg", "1deg"] | None,
@@ -249,7 +266,12 @@ def run_report(
 
     The page works offline. Trials are compared by map, data, start, method and settings. A trial in several files counts once.
     """
-    # Imported when a report is made, since help pages do not need it.
+    if view is not None and not view.is_file():
+        raise InputError("no such page", where=view, expected="one written by 'bidnerf view MAP --results ... --save'")
+    if missing := [folder for folder in data if not Path(folder).is_dir()]:
+        raise InputError("no such folder", where=missing[0], expected="a dataset that the results are of")
+    check_folder(out, (*results, *data))
+
     from bidnerf.evaluation import ResultTable, choose_criterion, read_runs, write_report
     from bidnerf.results import CRITERIA
 
@@ -257,11 +279,6 @@ def run_report(
     with wrong_usage():
         names = [name for name in CRITERIA if criterion and name.startswith(criterion)]
         chosen = choose_criterion(names[0] if names else None, table.groups)
-    if view is not None and not view.is_file():
-        raise InputError("no such page", where=view, expected="one written by 'bidnerf view MAP --results ... --save'")
-    if missing := [folder for folder in data if not Path(folder).is_dir()]:
-        raise InputError("no such folder", where=missing[0], expected="a dataset that the results are of")
-    check_folder(out, (*results, *data))
     runs = [(path.name, read_runs(path)) for path in results]
     link = None if view is None else quote(Path(os.path.relpath(view.resolve(), out.resolve())).as_posix())
     with console.status("drawing"):

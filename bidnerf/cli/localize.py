@@ -11,21 +11,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from bidnerf.cli.options import (
-    TEST_IMAGES,
-    MapFolder,
     MethodGroup,
     Queries,
+    QueryImages,
     RunOptions,
     Seed,
-    SeenImages,
+    StartFile,
     pose_file_help,
     refuse,
     require_device,
+    require_map,
     require_one,
+    require_pose_file,
+    require_some,
     wrong_usage,
 )
 from bidnerf.cli.output import check_folder, check_output, print_json, say, show
-from bidnerf.cli.parser import Group, Option
+from bidnerf.cli.parameters import Check, Group, Option
 from bidnerf.cli.running import display_progress
 from bidnerf.cli.signals import defer_interruptions
 from bidnerf_core.errors import InputError, UsageError, amount, enumeration, errors_in
@@ -43,7 +45,7 @@ class StartOptions:
     """Where localization starts: at most one of these, by default nowhere."""
 
     start: Annotated[
-        Path | None,
+        StartFile,
         Option("POSE.json", "file with a 4x4 T_world_camera to start from, or with one per query by name"),
     ] = None
     perturb: Annotated[
@@ -86,18 +88,15 @@ class StartOptions:
 class AnswerOutput(RunOptions):
     """Where answers are computed, and where they are written."""
 
-    out: Annotated[Path | None, Option("POSES", pose_file_help)] = None
+    out: Annotated[Path | None, Option("POSES", pose_file_help), Check(require_pose_file)] = None
     draw: Annotated[Path | None, Option("DIR", "draw each photo next to the map rendered from the pose found")] = None
 
     def check(self, inputs: Sequence[Path]) -> None:
         """Check that the outputs can be written, before any work is done."""
-        from bidnerf.results import check_pose_file
-
         if self.out is not None:
-            check_pose_file(self.out)
             check_output(self.out, inputs, self.overwrite)
         if self.draw is not None:
-            check_folder(self.draw, inputs, create=True)
+            check_folder(self.draw, inputs)
 
     def picture(self, name: str) -> Path:
         """Return the path of the picture for the image ``name``."""
@@ -106,7 +105,7 @@ class AnswerOutput(RunOptions):
 
 
 def run_localize(
-    map: Annotated[MapFolder, Option("MAP", "folder of a map, or of several maps", positional=True)],
+    map: Annotated[Path, Option("MAP", "folder of a map, or of several maps", positional=True)],
     query: Annotated[
         tuple[Path, ...],
         Option(
@@ -115,11 +114,12 @@ def run_localize(
             " image is localized in the one it shows",
             positional=True,
         ),
+        Check(require_some),
     ],
     *,
     output: Annotated[AnswerOutput, Group("output", "Where answers are computed, and where they are written.")],
     queries: Queries,
-    images: SeenImages = TEST_IMAGES,
+    images: QueryImages,
     start: Annotated[StartOptions, Group("start", "Where localization starts. By default, it needs no start.")],
     method: MethodGroup,
 ) -> None:
@@ -130,16 +130,27 @@ def run_localize(
     relative poses come from the dataset, and the pose found is that of the last one's camera. Poses are camera to world with
     OpenCV axes (x right, y down, z forward).
     """
-    from bidnerf.results import Answers, localize, pose_format
-    from bidnerf_core.localization import matches_landmarks, require_fit
-    from bidnerf_core.maps import Localizer, MapCollection, landmark_cameras, load_map, maps_in
-
     count = next((n for n, path in enumerate(query) if not _holds_maps(path)), len(query))
     maps, paths = [map, *query[:count]], query[count:]
     if not paths:
         named = enumeration([repr(str(path)) for path in maps])
         expected = "MAP first, then image files, folders of photos, or a folder of a dataset"
         raise UsageError(f"no QUERY after {named};", expected=expected)
+    from bidnerf_core.maps import maps_in
+
+    if not maps_in(map):
+        require_map(map)
+    files = (*paths, *queries.depth, start.start, images.camera, images.register_depth)
+    inputs = [Path(file) for file in files if isinstance(file, str | Path)]
+    output.check(inputs)
+    if start.perturb is not None and not queries.is_dataset(paths):
+        raise UsageError("--perturb moves the true pose, which photos do not have;", expected="--start")
+    opener = queries.opener(paths, images)
+
+    from bidnerf.results import Answers, localize, pose_format
+    from bidnerf_core.localization import matches_landmarks, require_fit
+    from bidnerf_core.maps import Localizer, MapCollection, landmark_cameras, load_map
+
     start_of = start.of_queries()
     with wrong_usage():
         require_fit(
@@ -148,27 +159,24 @@ def run_localize(
             "needs a start; give one by --start, or use method",
         )
     require_device(output.device)
-    if start.perturb is not None and not queries.is_dataset(paths):
-        raise UsageError("--perturb moves the true pose, which photos do not have;", expected="--start")
-    files = (*paths, *queries.depth, start.start, images.camera, images.register_depth)
-    inputs = [Path(file) for file in files if isinstance(file, str | Path)]
-    output.check(inputs)
-    opener = queries.opener(paths, images)
+    config = method.config()
+    if output.draw is not None:
+        check_folder(output.draw, inputs, create=True)
     if len(maps) > 1 or maps_in(map) not in ([], [map]):
         given = {"--start": start.start, "--perturb": start.perturb, "--draw": output.draw}
         refuse(given, "applies to one map, but several are given")
         if output.out is not None and pose_format(output.out) != ".json":
             raise UsageError("poses in several maps have different worlds", where=output.out, expected="a .json file")
         with display_progress():
-            collection = MapCollection(maps, method.method, method.config, device=output.device)
+            collection = MapCollection(maps, method.method, config, device=output.device)
         finder: Localizer | MapCollection = collection
         answers, source = Answers(collection), opener(collection.cameras, None)
     else:
         scene = load_map(map, output.device)
-        cameras = landmark_cameras(scene) if matches_landmarks(method.method, method.config) else ()
+        cameras = landmark_cameras(scene) if matches_landmarks(method.method, config) else ()
         source = opener(cameras, scene.bounds.background)
         answers = Answers(scene)
-        finder = Localizer(scene, method.method, method.config, warm_up=len(source.names) > 1)
+        finder = Localizer(scene, method.method, config, warm_up=len(source.names) > 1)
     if output.draw is not None:
         for name in source.names:
             check_output(output.picture(name), inputs, output.overwrite)
@@ -178,13 +186,15 @@ def run_localize(
 
 
 def _holds_maps(path: Path) -> bool:
-    from bidnerf_core.datasets import find_reader
-    from bidnerf_core.io import IMAGE_SUFFIXES
     from bidnerf_core.maps import maps_in
 
     maps = maps_in(path)
     if not maps or maps == [path]:
         return bool(maps)
+
+    from bidnerf_core.datasets import find_reader
+    from bidnerf_core.io import IMAGE_SUFFIXES
+
     images = any(file.suffix.lower() in IMAGE_SUFFIXES for file in path.iterdir())
     return not images and find_reader(path) is None
 

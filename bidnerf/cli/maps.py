@@ -13,6 +13,7 @@ from bidnerf.cli.options import (
     BakeSettings,
     ColourImages,
     Device,
+    First,
     FrameNames,
     Json,
     MapFolder,
@@ -21,14 +22,14 @@ from bidnerf.cli.options import (
     Overwrite,
     RunOptions,
     WholeImages,
+    existing,
     installed,
     refuse,
     require_device,
-    require_inputs,
     require_one,
 )
 from bidnerf.cli.output import check_folder, check_output, print_result, say
-from bidnerf.cli.parser import Flag, Group, Option, SettingsGroup
+from bidnerf.cli.parameters import Flag, Group, Option, SettingsGroup
 from bidnerf.cli.running import display_progress, interruptible_work
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.progress import counter
@@ -93,9 +94,10 @@ def run_export(
 
     The files are in the map's frame and unit.
     """
+    check_folder(out, (map,))
+
     from bidnerf.results import export_map
 
-    check_folder(out, (map,))
     files = export_map(map, out, to, overwrite)
     sizes = {str(file): file.stat().st_size for file in files}
     print_result(sizes, [f"{file}: {size / 1e6:.2f} MB" for file, size in sizes.items()], json)
@@ -117,6 +119,7 @@ def run_scale(
             "file with the true positions of three or more of the map's cameras in metres, in any world:"
             " {NAME: [x, y, z], ...}, or poses as localize --out POSES.json writes them",
         ),
+        existing("the positions of cameras"),
     ] = None,
     factor: Annotated[
         float | None, Above(0.0), Option("F", "metres per unit of the map; 1 states that its unit is the metre")
@@ -132,9 +135,6 @@ def run_scale(
     All of it is converted: field, bounds, surface, landmarks, capture record and anchor. Poses, covariances and errors are then in metres, so measured depth can be used. Exactly one of
     --distance, --poses and --factor is required: it gives the length of a unit.
     """
-    from bidnerf.results import read_positions
-    from bidnerf_core.maps import factor_of_distance, factor_of_poses, load_info, load_map, map_folder
-
     require_one({"--distance": distance, "--poses": poses, "--factor": factor}, required=True)
     first, second, length = distance or ("", "", "1")
     try:
@@ -143,7 +143,10 @@ def run_scale(
         raise UsageError(f"METRES is {length!r}", where="--distance", expected="a number") from error
     if out is not None:
         check_folder(out, (map,), may_be_map=overwrite)
-    load_info(map)  # raises if there is no map
+
+    from bidnerf.results import read_positions
+    from bidnerf_core.maps import factor_of_distance, factor_of_poses, load_map, map_folder
+
     # The map is locked before it is read, so that no other program changes it meanwhile.
     with map_folder(out or map, overwrite or out is None):
         scene = load_map(map)
@@ -162,9 +165,10 @@ def run_scale(
 
 def run_render(
     map: MapFolder,
-    data: Annotated[Path, Option("DATA", "folder of a dataset", positional=True)],
+    data: Annotated[Path, Option("DATA", "folder of a dataset", positional=True), existing("a dataset")],
     out: Annotated[Path, Option("DIR", "folder for the images")],
     frame: FrameNames = (),
+    first: Annotated[First, EXPERT] = None,
     level: Annotated[
         int | None, EXPERT, Option("N", "level of detail, 0 the coarsest", "the field itself, the finest")
     ] = None,
@@ -177,18 +181,22 @@ def run_render(
     For each frame, NAME.png (8-bit RGB) and NAME.depth.png (16-bit, planar z in mm, 0 where rays hit nothing) are written to
     --out, and PSNR and depth error against the dataset's images are printed.
     """
+    check_folder(out, (map, data))
+    require_device(run.device)
+
     from bidnerf_core.io import output_folder
     from bidnerf_core.maps import load_info, load_map
 
-    check_folder(out, (map, data))
-    require_device(run.device)
     with output_folder(out, run.overwrite), display_progress():
         dataset = replace(images, background=load_info(map).bounds.background).open(data)
-        views = dataset.views(images.split, list(frame) or None)
+        names = list(frame) or None
+        if first is not None:
+            names = (names or dataset.frame_names(images.split))[:first]
+        views = dataset.views(images.split, names)
         if not views:
             raise InputError(f"split {images.split!r} has no frames", where=data)
-        scene, names = load_map(map, run.device), [view.frame.name for view in views]
-        for name in {f"{name}.depth" for name in names} & set(names):
+        scene, rendered = load_map(map, run.device), {view.frame.name for view in views}
+        for name in {f"{name}.depth" for name in rendered} & rendered:
             raise InputError(
                 f"frame {name!r} would overwrite the depth of {name.removesuffix('.depth')!r}; render them one by one"
                 " with --frame, into different folders"
@@ -241,6 +249,7 @@ def run_bake(
             "dataset whose photos give landmarks and whose measured depth gives the surface",
             "rendered images only",
         ),
+        existing("a dataset"),
     ] = None,
     rendered_landmarks: Annotated[
         Flag, EXPERT, Option(None, "replace landmarks of photos by landmarks of rendered images")
@@ -264,19 +273,19 @@ def run_bake(
     from images rendered by the field, which are only as sharp as the field. Landmarks from photos are kept unless --data gives
     new photos or --rendered-landmarks is set.
     """
-    from bidnerf_core.maps import load_map
-
     if rendered_landmarks:
         refuse({"--data": data}, "gives photos, but --rendered-landmarks uses none;", expected="only one of them")
     if data is None:
         refuse({"--masks": images.masks}, "was given without --data", expected="the dataset that they belong to")
     require_device(device)
-    require_inputs(data)
+
+    from bidnerf_core.maps import load_map
+
     # The baked parts may be damaged, so they are not loaded here.
     scene = load_map(map, device, baked=False)
     with interruptible_work(kept=f"stopped; {map} keeps the parts that were finished"):
         scene = scene.bake(
-            data, config, images=images, rendered_landmarks=rendered_landmarks, features=landmark_features
+            data, config(), images=images, rendered_landmarks=rendered_landmarks, features=landmark_features
         )
     print_result(scene.describe().plain(), (), json)
 
@@ -286,10 +295,12 @@ def run_extend(
     new: Annotated[
         Path,
         Option("NEW", "photo, folder of photos, or dataset (whose own poses are ignored)", positional=True),
+        existing("photos or a dataset"),
     ],
     data: Annotated[
         Path | None,
         Option("DATA", "dataset that the map was built from", "none: images rendered by the field replace it"),
+        existing("a dataset"),
     ] = None,
     steps: Annotated[
         int | None,
@@ -312,7 +323,6 @@ def run_extend(
     from bidnerf_core.maps import extend, load_info
 
     require_device(device)
-    require_inputs(new, data)
     info = load_info(map)
     given = {"--camera": images.camera, "--register-depth": images.register_depth, "--depth-unit": images.depth_unit}
     is_stated = any(value is not None for value in given.values())
@@ -324,7 +334,9 @@ def run_extend(
     opened: dict[Path, Path | Capture] = {path: options.open(path) for path in datasets}
     known = None if data is None else opened.get(data, data)
     with interruptible_work(kept=f"stopped; {map} is unchanged"):
-        scene = extend(map, opened.get(new, new), known, split=images.split, steps=steps, config=config, device=device)
+        scene = extend(
+            map, opened.get(new, new), known, split=images.split, steps=steps, config=config(), device=device
+        )
     added, total = len(scene.info.cameras) - len(info.cameras), len(scene.info.cameras)
     text = f"{map}: {amount(added, 'photo')} added, {amount(total, 'image')} in all"
     print_result(scene.describe().plain(), [text], json)
@@ -353,6 +365,7 @@ class WorldOptions:
     T_world_file: Annotated[
         Path | None,
         EXPERT,
+        existing("a pose file"),
         Option("POSE.json", "file of a pose (JSON, 4x4) that takes the scaled coordinates of the file to the world"),
     ] = None
 
@@ -361,6 +374,7 @@ def run_import(
     file: Annotated[
         Path,
         Option("FILE", "file or folder of a trained field, or folder of a COLMAP project", positional=True),
+        existing("a trained field or a COLMAP model"),
     ],
     out: Annotated[Path, Option("MAP", "folder for the map")],
     importer: Annotated[
@@ -373,6 +387,7 @@ def run_import(
     photos: Annotated[
         Path | None,
         Option("DATA", "dataset whose photos, with poses in the world, provide the landmarks", "rendered images"),
+        existing("a dataset"),
     ] = None,
     target: NewMap,
     images: ColourImages,
@@ -382,6 +397,7 @@ def run_import(
             "settings of the importer named by --importer",
             "What the importer cannot find in the file.",
             _importer_settings,
+            "importers",
         ),
     ] = None,
 ) -> None:
@@ -394,15 +410,16 @@ def run_import(
     The points and tracks of a COLMAP model (a project folder or the model in it) become the landmarks, and answers are in its
     world; its files are not changed. Such a map localizes photos without a field, which 'bidnerf train FILE --out MAP' adds.
     """
+    check_folder(out, (file, photos), may_be_map=True)
+    require_device(target.device)
+
     from bidnerf.results import read_pose
     from bidnerf_core.maps import ImportOptions, import_map
 
-    check_folder(out, (file, photos), may_be_map=True)
-    require_device(target.device)
     pose = None if world.T_world_file is None else read_pose(world.T_world_file)
     options = ImportOptions(
         images, target.landmark_features, target.device, target.overwrite, importer, world.scale, pose
     )
     with interruptible_work(kept=f"stopped; {out} was not written"):
-        scene = import_map(file, out, config, photos=photos, bake=not target.no_bake, options=options)
+        scene = import_map(file, out, config(), photos=photos, bake=not target.no_bake, options=options)
     print_result(scene.describe().plain(), (), target.json)

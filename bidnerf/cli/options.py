@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
-from bidnerf.cli.parser import FLAG, Group, Option, SettingsGroup, Without, as_usage_error
+from bidnerf.cli.parameters import FLAG, Check, Group, Option, SettingsGroup, Without
+from bidnerf.cli.parser import as_usage_error
 from bidnerf_core import datasets, mapping
 from bidnerf_core.datasets import TEST_IMAGES as TEST_IMAGES
 from bidnerf_core.datasets import DatasetOptions
@@ -22,15 +23,63 @@ if TYPE_CHECKING:
     from bidnerf_core.datasets import DatasetFrames, Photos
     from bidnerf_core.io import Background
 
-ImageOptions: TypeAlias = Annotated[DatasetOptions, Group("images", "How the images and their depth are read.")]
+
+def require_inputs(*paths: Path | str | None, expected: str = "the name of one that exists") -> None:
+    """Raise ``InputError`` if a file or a folder does not exist; scenes in memory, such as demo:blobs, need none."""
+    for path in paths:
+        if path is not None and not str(path).startswith("demo:") and not Path(path).exists():
+            raise InputError("no such file or folder", where=path, expected=expected)
+
+
+def existing(expected: str) -> Check:
+    """Return the check that a path exists; the error says what was ``expected``."""
+    return Check(lambda path: require_inputs(path, expected=expected))
+
+
+def require_some(paths: Sequence[Path]) -> None:
+    """Raise ``InputError`` if none of the paths exists; a single one that is missing does not stop the others."""
+    if not any(path.exists() for path in paths):
+        require_inputs(*paths)
+
+
+def require_map(folder: Path | str) -> None:
+    """Raise ``InputError`` unless a folder holds the description of a map."""
+    from bidnerf_core.maps import read_description
+
+    if not str(folder).startswith("demo:"):
+        read_description(Path(folder))
+
+
+def require_image_files(images: DatasetOptions) -> None:
+    """Raise ``InputError`` if a file or a folder that the options name does not exist."""
+    for file in (images.camera, images.register_depth):
+        if isinstance(file, str | Path) and Path(file).suffix:  # others are names, such as freiburg1
+            require_inputs(file, expected="a file with the intrinsics")
+    for folder in (images.images, images.masks):
+        require_inputs(folder if isinstance(folder, str | Path) else None)
+
+
+def require_pose_file(path: Path) -> None:
+    """Raise ``InputError`` unless poses can be written to a file of this name."""
+    from bidnerf.results import check_pose_file
+
+    check_pose_file(path)
+
+
+ImageOptions: TypeAlias = Annotated[
+    DatasetOptions, Group("images", "How the images and their depth are read."), Check(require_image_files)
+]
 MappedImages: TypeAlias = Annotated[ImageOptions, Without("background")]  # in the map, which has a background
 SeenImages: TypeAlias = Annotated[MappedImages, Without("largest")]  # localized at the size that the method chooses
+QueryImages: TypeAlias = Annotated[SeenImages, Without("split")]  # photos may be queries, which have no splits
 WholeImages: TypeAlias = Annotated[SeenImages, Without("masks", "mask_hides")]  # of which every pixel counts
 ColourImages: TypeAlias = Annotated[  # whose depth is not used
     WholeImages, Without("register_depth", "depth_unit"), Group("images", "How the images are read.")
 ]
 
-MapFolder: TypeAlias = Annotated[Path, Option("MAP", "folder of a map, as written by 'bidnerf train'", positional=True)]
+MapFolder: TypeAlias = Annotated[
+    Path, Option("MAP", "folder of a map, as written by 'bidnerf train'", positional=True), Check(require_map)
+]
 Device: TypeAlias = Annotated[str, Option("NAME", "device to compute on, such as cpu, cuda or cuda:1")]
 Host: TypeAlias = Annotated[
     str | None,
@@ -39,7 +88,9 @@ Host: TypeAlias = Annotated[
 Port: TypeAlias = Annotated[int, WholeNumbers(0, 65535), Option("N", "port to listen on; 0 picks a free one")]
 Seed: TypeAlias = Annotated[int, WholeNumbers(0, LARGEST_SEED), Option("N", "seed of every random choice")]
 Json: TypeAlias = Annotated[bool, FLAG, Option(None, "print JSON, one value per line")]
-NoDepth: TypeAlias = Annotated[bool, FLAG, Option(None, "leave out measured depth")]
+First: TypeAlias = Annotated[int | None, WholeNumbers(1), Option("N", "use only the first N images", "all")]
+NoDepth: TypeAlias = Annotated[bool, FLAG, EXPERT, Option(None, "leave out measured depth")]
+StartFile: TypeAlias = Annotated[Path | None, existing("a pose file")]
 Names: TypeAlias = tuple[str, ...]
 FrameNames: TypeAlias = Annotated[Names, Option("NAME...", "use only these frames of the dataset", "all of the split")]
 
@@ -112,7 +163,7 @@ class MethodOptions:
     ] = None
     config: Annotated[
         Any,
-        SettingsGroup("settings of the method", "How the method named by --method works.", _method_settings),
+        SettingsGroup("settings of the method", "How the method named by --method works.", _method_settings, "methods"),
     ] = None
 
 
@@ -158,13 +209,6 @@ def require_device(device: str) -> None:
 
         with wrong_usage():
             working_device(device)
-
-
-def require_inputs(*paths: Path | None) -> None:
-    """Raise ``InputError`` if a file or a folder does not exist, before anything is loaded."""
-    for path in filter(None, paths):
-        if not path.exists():
-            raise InputError("no such file or folder", where=path, expected="the name of one that exists")
 
 
 @contextlib.contextmanager
@@ -213,8 +257,13 @@ class QueryOptions:
     depth: Annotated[
         tuple[Path, ...],
         Option("FILE...", "depth images or .npy files of the photos, in the same order, or matched by name"),
+        Check(require_some),
     ] = ()
     frame: FrameNames = ()
+    first: Annotated[First, EXPERT] = None
+    split: Annotated[
+        str | None, Option("NAME", "split of the dataset; all: every image with a pose", TEST_IMAGES.split)
+    ] = None
     rig: Annotated[bool, FLAG, Option(None, "find one pose for the frames in --frame, together as a rig")] = False
     window: Annotated[
         int,
@@ -235,10 +284,17 @@ class QueryOptions:
 
     def is_dataset(self, paths: Sequence[Path]) -> bool:
         """Return whether the QUERY arguments are a dataset, rather than photos."""
-        from bidnerf_core.datasets import find_reader
         from bidnerf_core.io import IMAGE_SUFFIXES
 
-        return bool(self.frame) or any(p.suffix.lower() not in IMAGE_SUFFIXES and find_reader(p) for p in paths)
+        if self.frame:
+            return True
+        others = [path for path in paths if path.suffix.lower() not in IMAGE_SUFFIXES]
+        if not others:  # which is known without the readers
+            return False
+
+        from bidnerf_core.datasets import find_reader
+
+        return any(map(find_reader, others))
 
     def opener(self, paths: Sequence[Path], images: DatasetOptions) -> QueryOpener:
         """Check the QUERY arguments before a map is loaded, and return a function that opens them.
@@ -246,23 +302,33 @@ class QueryOptions:
         The arguments are image files and folders of photos, or one dataset. Raises ``InputError`` if they hold neither,
         and ``UsageError`` for options that apply only to the other kind.
         """
-        from bidnerf_core.datasets import DatasetFrames, Photos, depth_files, photo_files
-        from bidnerf_core.io import is_heif, open_binary
-
         if self.is_dataset(paths):
+            from bidnerf_core.datasets import DatasetFrames
+
             if len(paths) > 1:
                 raise UsageError(f"{len(paths)} queries including a dataset", expected="only the dataset")
             refuse(
                 {"--depth": self.depth, "--focal": self.camera.focal, "--hfov": self.camera.hfov},
                 f"is for photos, but {paths[0]} is a dataset, which has its own; to use its images as photos, name the files",
             )
-            return lambda _, background: DatasetFrames(
-                replace(images, background=background).open(paths[0]), images.split, self.frame, self.window, self.rig
-            )
-        split = None if images.split == TEST_IMAGES.split else images.split
-        refuse({"--split": split}, f"is for a dataset, but {paths[0]} is none; leave it out")
+
+            def frames(_: Sequence[Intrinsics], background: Background | None) -> DatasetFrames:
+                dataset = replace(images, background=background).open(paths[0])
+                queries = DatasetFrames(dataset, self.split or TEST_IMAGES.split, self.frame, self.window, self.rig)
+                return queries.select(range(len(queries.names))[: self.first])
+
+            return frames
+        refuse({"--split": self.split}, f"is for a dataset, but {paths[0]} is none; leave it out")
         if self.window > 1:
             raise UsageError(f"--window {self.window} needs known relative poses", expected="a dataset")
+        if not self.depth:
+            of_depth = {"--depth-unit": images.depth_unit, "--register-depth": images.registration or None}
+            refuse(of_depth, "was given without --depth", expected="the depth image that it belongs to")
+        require_one({"--camera": images.camera, "--focal": self.camera.focal, "--hfov": self.camera.hfov})
+
+        from bidnerf_core.datasets import Photos, depth_files, photo_files
+        from bidnerf_core.io import is_heif, open_binary
+
         files = photo_files(paths, self.depth)
         for file in filter(Path.is_file, files):
             head = b""
@@ -271,14 +337,10 @@ class QueryOptions:
             if is_heif(head):
                 import_extra("pillow_heif", "heif", "reading HEIC", file, "; or convert the photo to JPEG")
         depth = depth_files(files, self.depth)
-        if not self.depth:
-            of_depth = {"--depth-unit": images.depth_unit, "--register-depth": images.registration or None}
-            refuse(of_depth, "was given without --depth", expected="the depth image that it belongs to")
-        for given in (files, self.depth):
-            if not any(file.exists() for file in given):  # a single one does not stop the others
-                require_inputs(*given)
         return lambda assumed, background: Photos(
-            files, replace(images, camera=self.camera.source(images.camera, assumed), background=background), depth
+            files[: self.first],
+            replace(images, camera=self.camera.source(images.camera, assumed), background=background),
+            depth,
         )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import ast
-import builtins
+import contextlib
 import dataclasses
 import difflib
 import functools
@@ -21,14 +21,15 @@ import sys
 import textwrap
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import MISSING
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn, TypeVar
+from typing import Any, Literal, NoReturn, TypeVar
 
+from bidnerf.cli.parameters import FLAG, Check, Group, Parameter, SettingsGroup, bare, leaves, parameters_of
 from bidnerf.cli.program import option_name
-from bidnerf_core.errors import InputError, UsageError, enumeration, spelled, spelling_hint
+from bidnerf_core.errors import InputError, UsageError, enumeration, spelling_hint
 from bidnerf_core.registry import list_plugins, registered
 from bidnerf_core.settings import Allowed, Expert, OneOf
 
@@ -37,8 +38,8 @@ T = TypeVar("T")
 HELP, HELP_ALL = "--help", "--help-all"
 NEGATIVE = re.compile(r"-[\d.]")
 """Matches the beginning of a value such as -1,0,2, which is not an option."""
-FIELD = re.compile(r"^    (\w+): ", re.MULTILINE)
-"""Matches the name of a field of a dataclass in its source."""
+DATACLASS = re.compile(r"^@[\w.]*dataclass\b.*\nclass .*\n(?:(?:[ \t].*)?\n)+", re.MULTILINE)
+"""Matches a dataclass in its source."""
 ESCAPE = "\0"
 """Precedes words that are no options, though they look like one; arguments of a program cannot contain it."""
 MISSING_ARGUMENTS = "the following arguments are required: "  # argparse's words
@@ -48,103 +49,6 @@ KINDS = {
     str: ("TEXT", "text"),
     Path: ("PATH", "a path"),
 }
-
-
-@dataclass(frozen=True)
-class Option:
-    """The name and description of an argument.
-
-    Without ``help``, the docstring or comment beside the field describes the argument. A function that returns the text is called when
-    a help page shows it.
-    """
-
-    metavar: str | None = None
-    help: str | Callable[[], str] = ""
-    default: str | None = None  # in words; None: the value itself; empty: it is not mentioned
-    positional: bool = False
-
-
-class Without(frozenset[str]):
-    """The options of a nested dataclass that a command leaves out."""
-
-    def __new__(cls, *names: str) -> Without:
-        return super().__new__(cls, names)
-
-
-@dataclass(frozen=True)
-class Group:
-    """The title of the options of a nested dataclass on help pages, and a sentence about them for users.
-
-    Options of a dataclass without one stand among those of the dataclass around it.
-    """
-
-    title: str
-    text: str
-
-
-@dataclass(frozen=True)
-class SettingsGroup(Group):
-    """Marks a parameter that takes a dataclass of settings, which depends on other arguments or is slow to import.
-
-    ``load`` returns the default settings, given the values of the options parsed so far, by parameter name, and all
-    words of the command line. ``--help-all`` describes the options of the settings; ``--help`` only mentions them by
-    the title.
-    """
-
-    load: Callable[[Mapping[str, Any], Sequence[str]], Any]
-
-
-FLAG = "flag"
-"""Marks a bool that has an option only for True, and none, such as --no-NAME, for False."""
-Flag = Annotated[bool, FLAG]
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """A parameter of a command, or a field of its options."""
-
-    name: str
-    hint: Any
-    notes: tuple[Any, ...]
-    default: Any  # MISSING if it is required
-    doc: str
-
-    def note(self, kind: type[T]) -> T | None:
-        """Return the last annotation of type ``kind``, or None if there is none."""
-        return next((note for note in reversed(self.notes) if isinstance(note, kind)), None)
-
-    @property
-    def option(self) -> Option:
-        """The ``Option`` among the annotations, or else an ``Option`` whose metavar is the first string among them."""
-        return self.note(Option) or Option(next((n for n in self.notes if isinstance(n, str) and n != FLAG), None))
-
-    @property
-    def flag(self) -> str:
-        """The option string, such as --depth-unit."""
-        return option_name(self.name)
-
-    @property
-    def left_out(self) -> frozenset[str]:
-        """The fields that are not options, if the parameter is a dataclass."""
-        return frozenset(name for note in self.notes if isinstance(note, Without) for name in note)
-
-    @property
-    def description(self) -> str:
-        """The help text, with the default."""
-        option, default, words = self.option, self.default, self.option.default
-        if words is None and default is not MISSING and default not in (None, (), "") and default is not False:
-            values = default if isinstance(default, tuple) else (default,)
-            words = " ".join(
-                f"{x:.4g}" if type(x) is float else f"{x:,}" if type(x) is int and x >= 10_000 else str(x)
-                for x in values
-            )
-        text = option.help if isinstance(option.help, str) else option.help()
-        text = spelled(" ".join((text or self.doc).replace("``", "'").split()), option_name)
-        if default is MISSING and not option.positional:
-            text += " (required)"
-        elif words and "(default: " not in text:
-            text += f" (default: {words.replace('True', 'yes')})"
-        return text.replace("%", "%%")
 
 
 def parse(command: str, target: Callable[..., T], arguments: Sequence[str]) -> T:
@@ -157,55 +61,52 @@ def parse(command: str, target: Callable[..., T], arguments: Sequence[str]) -> T
     words = [re.sub("^--[^=]*", lambda name: name[0].replace("_", "-"), word) for word in arguments[:end]]
     pages, words = {"-h", HELP, HELP_ALL} & set(words), [*words, *arguments[end:]]
     short, loaded = bool(pages) and HELP_ALL not in pages, dict[str, Any]()  # the default settings, by parameter name
-    pending = {p.name: note for p, note in leaves(target, {}) if isinstance(note, SettingsGroup)}
-    if pending and not short:
-        first = _Parser(command, target, {}, options_only=True)
-        given = vars(first.parse_known_args(_escape(words))[0])
-        if not pages and not first.may_hold_a_setting(words):
-            _Parser(command, target, {}).parse_all(words)  # refuses what is missing before settings are loaded
-        values = {p.name: p.default for p, _ in leaves(target, {})} | given
+    usual = {parameter.name: parameter.default for parameter, _ in leaves(target, {})}
+    pending = {parameter.name: note for parameter, note in leaves(target, {}) if isinstance(note, SettingsGroup)}
+    parser = _Parser(command, target, {}, short)
+    if (
+        pending
+        and not short
+        and (pages or parser.may_hold_a_setting(words, {note.plugins for note in pending.values()}))
+    ):
+        options = _Parser(command, target, {}, options_only=True)
+        values = usual | vars(options.parse_known_args(_escape(words))[0])
         loaded = {name: note.load(values, words) for name, note in pending.items()}
-    parser = _Parser(command, target, loaded, short)
+        parser = _Parser(command, target, loaded)
     if pages:
         sys.stdout.write(parser.format_help())
         raise SystemExit(0)
-    return _build(target, parser.parse_all(words), loaded)
+    given = parser.parse_all(words)
+
+    def settings(name: str) -> Any:
+        default = loaded[name] if name in loaded else pending[name].load(usual | given, words)
+        return None if default is None else _build(type(default), given, [], default)
+
+    return _build(target, given | {name: functools.partial(settings, name) for name in pending}, [])
 
 
-def leaves(
-    target: Any,
-    loaded: Mapping[str, Any],
-    default: Any = None,
-    left_out: frozenset[str] = frozenset(),
-    group: Group | None = None,
-) -> Iterator[tuple[Parameter, Group | None]]:
-    """Yield each parameter of ``target``, or in place of nested dataclasses their fields, with its group."""
-    for parameter in parameters_of(target):
-        if parameter.name in left_out:
-            continue
-        if default is not None:
-            parameter = dataclasses.replace(parameter, default=getattr(default, parameter.name))
-        own, nested = parameter.note(Group) or group, loaded.get(parameter.name, parameter.default)
-        if dataclasses.is_dataclass(nested):
-            yield from leaves(type(nested), loaded, nested, parameter.left_out, own)
-        else:
-            yield parameter, own
+def _build(
+    target: Callable[..., T], given: Mapping[str, Any], checks: list[Callable[[], object]], default: Any = None
+) -> T:
+    """Call ``target`` with the given values for its parameters and for the fields of nested dataclasses.
 
-
-def _build(target: Callable[..., T], given: Mapping[str, Any], loaded: Mapping[str, Any], default: Any = None) -> T:
-    """Call ``target`` with the given values for its parameters and for the fields of nested dataclasses."""
+    Their checks are added to ``checks``, all of which are made before a command is called: then no arguments contradict each other.
+    """
     values = dict[str, Any]()
     for parameter in parameters_of(target):
         usual = parameter.default if default is None else getattr(default, parameter.name)
-        nested = loaded.get(parameter.name, usual)
-        if dataclasses.is_dataclass(nested):
+        if dataclasses.is_dataclass(usual):
             own = {name: value for name, value in given.items() if name not in parameter.left_out}
-            value = _build(type(nested), own, loaded, nested)
+            value = _build(type(usual), own, checks, usual)
             if value is not usual or default is None:
                 values[parameter.name] = value
         elif parameter.name in given:
             values[parameter.name] = given[parameter.name]
+        if (check := parameter.note(Check)) is not None and parameter.name in values:
+            checks.append(functools.partial(check.function, values[parameter.name]))
     if default is None:
+        for check_value in checks:
+            check_value()
         return target(**values)
     try:
         return dataclasses.replace(default, **values) if values else default
@@ -304,23 +205,26 @@ class _Parser(argparse.ArgumentParser):
         names = (word.split("=")[0] for word in itertools.takewhile("--".__ne__, words))
         return next((n for n in names if n.startswith("--") and n not in self._option_string_actions), None)
 
-    def may_hold_a_setting(self, words: Sequence[str]) -> bool:
+    def may_hold_a_setting(self, words: Sequence[str], groups: Collection[str | None]) -> bool:
         """Return whether the first unknown option is more like a setting of an installed package than like the known options.
 
-        The source of these packages is searched, since importing settings takes seconds. The result is True if a script
-        registered plugins of its own.
+        The dataclasses in the source of bidnerf's core, and of the plugins of these ``groups``, are searched for fields, since
+        importing settings takes seconds. Settings have defaults. The result is True if a script registered plugins of its own.
         """
-        groups, packages, fields = ("backends", "methods", "importers"), {"bidnerf_core"}, set[str]()
+        packages, fields = {"bidnerf_core"}, set[str]()
         unknown, known = self.unknown_option(words), self._option_string_actions
         if unknown is None or any(group in groups for group, _ in registered):
             return unknown is not None
-        packages |= {re.split("[.:]", info.value)[0] for group in groups for info in list_plugins(group)}
+        packages |= {re.split("[.:]", info.value)[0] for group in groups if group for info in list_plugins(group)}
         for spec in filter(None, map(find_spec, packages)):
             folders = map(Path, spec.submodule_search_locations or ())
             for file in [Path(spec.origin or ""), *(file for folder in folders for file in folder.rglob("*.py"))]:
                 if file.suffix == ".py" and file.is_file():  # not a namespace or an extension module
-                    source = file.read_text(encoding="utf-8", errors="replace")
-                    fields |= {option_name(name) for name in FIELD.findall(source)}
+                    for source in DATACLASS.findall(file.read_text(encoding="utf-8", errors="replace")):
+                        with contextlib.suppress(SyntaxError):  # of a later version of Python
+                            declared = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.AnnAssign)]
+                            if all(node.value is not None for node in declared):
+                                fields |= {option_name(ast.unparse(node.target)) for node in declared}
         near = difflib.get_close_matches(re.sub("^--no-", "--", unknown), fields.union(known), n=1, cutoff=0.8)
         return not fields.difference(known).isdisjoint(near)
 
@@ -362,86 +266,14 @@ def _escape(words: Sequence[str]) -> list[str]:
     return [*before, *(ESCAPE + word for word in words[end + 1 :])]
 
 
-@functools.cache
-def parameters_of(target: Any) -> list[Parameter]:
-    """Return the parameters of a function or a dataclass."""
-    kinds: Any = [kind for kind in reversed(getattr(target, "__mro__", (target,))) if kind is not object]
-    docs = dict[str, str]()
-    if dataclasses.is_dataclass(target):
-        defaults = {
-            field.name: field.default if field.default_factory is MISSING else field.default_factory()
-            for field in dataclasses.fields(target)
-            if field.init
-        }
-        for kind in kinds:
-            docs |= _field_docs(kind)
-    else:
-        defaults = {
-            name: MISSING if parameter.default is inspect.Parameter.empty else parameter.default
-            for name, parameter in inspect.signature(target).parameters.items()
-        }
-    hints = dict[str, Any]()
-    for kind in kinds:
-        module = vars(sys.modules[kind.__module__])
-        names, annotations = _Names(vars(builtins) | module), inspect.get_annotations(kind).items()
-        # typing's own evaluation raises NameError for names that are imported only for type checkers.
-        hints |= {name: eval(hint, module, names) if isinstance(hint, str) else hint for name, hint in annotations}
-    listed = []
-    for name, default in defaults.items():
-        hint, notes = _bare(hints[name])
-        is_group = default is MISSING and dataclasses.is_dataclass(hint)
-        listed.append(Parameter(name, hint, notes, hint() if is_group else default, docs.get(name, "")))
-    return listed
-
-
-class _Names(dict[str, Any]):
-    """Names for evaluating annotations; a name that is imported only for type checkers stands for ``object``."""
-
-    def __missing__(self, name: str) -> Any:
-        return object
-
-
-def _field_docs(kind: type) -> dict[str, str]:
-    """Return the description of each field of a dataclass: the docstring after it, or the comment on its lines or above it."""
-    try:
-        source = textwrap.dedent(inspect.getsource(kind))
-    except OSError:
-        return {}
-    lines = source.splitlines()
-    (tree,) = ast.parse(source).body
-    assert isinstance(tree, ast.ClassDef)
-    docs = dict[str, str]()
-    for node, after in zip(tree.body, [*tree.body[1:], None], strict=True):
-        if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
-            continue
-        if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
-            docs[node.target.id] = str(after.value.value)
-            continue
-        first = node.lineno - 1
-        if not any("# " in line for line in lines[first : node.end_lineno]):
-            while lines[first - 1].lstrip().startswith("#"):
-                first -= 1
-        comments = (line.partition("# ")[2].strip() for line in lines[first : node.end_lineno])
-        docs[node.target.id] = " ".join(filter(None, comments))
-    return docs
-
-
-def _bare(hint: Any) -> tuple[Any, tuple[Any, ...]]:
-    """Return a type without ``Annotated``, and its annotations."""
-    if typing.get_origin(hint) is Annotated:  # typing flattens nested annotations
-        kind, *notes = typing.get_args(hint)
-        return kind, tuple(notes)
-    return hint, ()
-
-
 def conversion(hint: Any, notes: Sequence[Any] = ()) -> tuple[int | str | None, Callable[[str], Any], str]:
     """Return argparse's ``nargs`` for a type (None for one word), the function that converts a word, and the metavar.
 
     The function checks values against the ranges and names among the annotations of the type and ``notes``.
     """
-    hint, own = _bare(hint)
+    hint, own = bare(hint)
     is_union = typing.get_origin(hint) in (typing.Union, types.UnionType)
-    parts = [_bare(part) for part in typing.get_args(hint)] if is_union else [(hint, ())]
+    parts = [bare(part) for part in typing.get_args(hint)] if is_union else [(hint, ())]
     limits = [n for group in (notes, own, *(more for _, more in parts)) for n in group if isinstance(n, Allowed)]
     members = [kind for kind, _ in parts]
     optional = type(None) in members

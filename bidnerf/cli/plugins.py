@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from bidnerf.cli.options import Json
 from bidnerf.cli.output import print_json, print_table, show
-from bidnerf.cli.parser import Option
+from bidnerf.cli.parameters import Option
 from bidnerf_core.errors import InputError
 from bidnerf_core.installation import requirements
 from bidnerf_core.registry import GROUPS, PluginInfo, list_plugins

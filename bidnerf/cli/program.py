@@ -28,7 +28,7 @@ from bidnerf_core.registry import Plugins, list_plugins
 
 def _command_defects(command: Any) -> Iterator[str]:
     """Yield the reasons why an object is not a command: a function with a docstring and annotated parameters."""
-    from bidnerf.cli.parser import parameters_of  # imported here for the sake of a quick --version
+    from bidnerf.cli.parameters import parameters_of  # imported here for the sake of a quick --version
 
     if not inspect.isfunction(command):
         yield f"it is a {type(command).__name__}, expected a function"

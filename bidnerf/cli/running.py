@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from rich.progress import (
     BarColumn,
@@ -97,23 +97,41 @@ def display_progress() -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def explained_interruption(kept: Callable[[], str]) -> Iterator[None]:
+    """If a signal stops the work in the context, print a line that states what is ``kept`` and how to go on, unless one has been printed."""
+    try:
+        yield
+    except Interrupted as stopped:
+        if not stopped.is_explained:
+            stopped.is_explained = True
+            say(kept())
+        raise
+
+
+@contextlib.contextmanager
 def interruptible_work(
-    announcement: str = "stopping after this step (Ctrl-C again: at once)", kept: str | None = None
+    announcement: str = "stopping after this step (Ctrl-C again: at once)",
+    kept: str | None = None,
+    at_once: Callable[[], str] = lambda: "stopped; what was finished is kept, and the same command goes on from there",
 ) -> Iterator[None]:
     """Display the progress of the work in the context, and let Ctrl-C stop it at its next check; a second Ctrl-C stops it at once.
 
-    Once the work has stopped at a check, a line states what was ``kept`` and how to go on, by default as the library says it, and
-    ``Interrupted`` is raised.
+    A line states what was ``kept`` and how to go on. By default, it is what the library says if the work stopped at a check, and what
+    ``at_once`` returns if another signal or a second Ctrl-C stopped it elsewhere. ``Interrupted`` is raised.
     """
     handler = installed_handler()
     handler.works, handler.announce = True, lambda: say(announcement)
     try:
-        with job_context(cancel=lambda: handler.waiting is not None), display_progress():
+        with (
+            explained_interruption(at_once if kept is None else lambda: kept),
+            job_context(cancel=lambda: handler.waiting is not None),
+            display_progress(),
+        ):
             yield
     except Cancelled as stopped:
         if handler.waiting is None:  # something other than Ctrl-C stopped it
             raise
         say(kept or str(stopped))
-        raise Interrupted(handler.waiting) from stopped
+        raise Interrupted(handler.waiting, is_explained=True) from stopped
     finally:
         handler.works, handler.waiting = False, None

@@ -18,9 +18,10 @@ STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP"
 class Interrupted(KeyboardInterrupt):
     """Raised when a signal asks the command to stop."""
 
-    def __init__(self, number: int) -> None:
+    def __init__(self, number: int, is_explained: bool = False) -> None:
         super().__init__(signal.Signals(number).name)
         self.number = number
+        self.is_explained = is_explained  # whether a line has stated what is kept
 
 
 class Handler:

@@ -9,18 +9,21 @@ from typing import Annotated, Any
 
 from bidnerf.cli.options import (
     CameraOptions,
+    First,
     MapFolder,
     NoDepth,
     PhotoCamera,
+    QueryImages,
     RunOptions,
-    SeenImages,
+    StartFile,
+    existing,
     pose_file_help,
     require_device,
-    require_inputs,
+    require_pose_file,
     wrong_usage,
 )
 from bidnerf.cli.output import check_output, print_json, print_table, say
-from bidnerf.cli.parser import Group, Option, SettingsGroup, Without
+from bidnerf.cli.parameters import Check, Group, Option, SettingsGroup
 from bidnerf.cli.running import display_progress
 from bidnerf.cli.signals import defer_interruptions
 from bidnerf_core import maps
@@ -35,6 +38,7 @@ class FrameOptions:
     """Which frames are tracked, and what they measure."""
 
     split: Annotated[str | None, EXPERT, Option("NAME", "use only the frames of one split of a dataset", "all")] = None
+    first: First = None
     every: Annotated[int, WholeNumbers(1), Option("N", "use only every Nth frame")] = 1
     no_depth: NoDepth = False
     depth_sensor: Annotated[
@@ -48,7 +52,7 @@ class TrackingOptions:
     """How tracking begins, and which poses it accepts."""
 
     start: Annotated[
-        Path | None, Option("POSE.json", "file with the approximate 4x4 T_world_camera of the first frame")
+        StartFile, Option("POSE.json", "file with the approximate 4x4 T_world_camera of the first frame")
     ] = None
     risk: Annotated[
         float | None,
@@ -71,13 +75,17 @@ class TrackingOptions:
 
 def run_track(
     map: MapFolder,
-    sequence: Annotated[Path, Option("SEQUENCE", "folder of a dataset or images, or a video", positional=True)],
-    out: Annotated[Path, Option("TRAJECTORY", pose_file_help)],
+    sequence: Annotated[
+        Path,
+        Option("SEQUENCE", "folder of a dataset or images, or a video", positional=True),
+        existing("a dataset, images or a video"),
+    ],
+    out: Annotated[Path, Option("POSES", pose_file_help), Check(require_pose_file)],
     plot: Annotated[Path | None, Option("PNG", "draw the path over the map's surface, coloured by uncertainty")] = None,
     *,
     run: RunOptions,
     frames: Annotated[FrameOptions, Group("frames", "Which frames are tracked, and whether their depth is used.")],
-    images: Annotated[SeenImages, Without("split")],
+    images: QueryImages,
     tracking: Annotated[TrackingOptions, Group("tracking", "How tracking begins, and which poses it accepts.")],
 ) -> None:
     """Find the poses of a sequence's frames in a map, one after another.
@@ -85,36 +93,35 @@ def run_track(
     Each pose is predicted from those before it, refined and validated. A frame whose pose is not accepted counts as lost; the
     following ones are searched for in the whole map. If the sequence has true poses, a table shows the errors.
     """
-    from bidnerf.results import Answers, check_pose_file, read_pose, require_matplotlib, track
+    if plot is not None and plot.suffix.lower() not in (".png", ".svg"):
+        raise UsageError(where=plot, expected="a name that ends with .png or .svg")
+    named = (sequence, images.camera, tracking.start, images.register_depth)
+    for file in filter(None, (out, plot)):
+        check_output(file, [Path(each) for each in named if isinstance(each, str | Path)], run.overwrite)
+
+    from bidnerf.results import Answers, read_pose, require_matplotlib, track
     from bidnerf_core.datasets import is_video
     from bidnerf_core.localization import settings_of
     from bidnerf_core.maps import Localizer, Tracker, load_map
 
-    check_pose_file(out)
     if plot is not None:
         require_matplotlib()
-        if plot.suffix.lower() not in (".png", ".svg"):
-            raise UsageError(where=plot, expected="a name that ends with .png or .svg")
-    named = (sequence, images.camera, tracking.start, images.register_depth)
-    for file in filter(None, (out, plot)):
-        check_output(file, [Path(each) for each in named if isinstance(each, str | Path)], run.overwrite)
     require_device(run.device)
-    require_inputs(sequence, tracking.start)
     if is_video(sequence):
         import_extra("av", "video", "reading a video", sequence, "; or extract its frames to a folder")
     start = None if tracking.start is None else read_pose(tracking.start)
     with wrong_usage():
         settings = settings_of(USUAL_METHOD, {"depth_sensor": frames.depth_sensor, "risk": tracking.risk})
-    scene = load_map(map, run.device)
-    path, began = Answers(scene, is_sequence=True, interval=tracking.config.frame_seconds), time.perf_counter()
+    scene, config = load_map(map, run.device), tracking.config()
+    path, began = Answers(scene, is_sequence=True, interval=config.frame_seconds), time.perf_counter()
     localizer = Localizer(scene, config=settings)
     try:
         with display_progress():
             source = frames.camera.source(images.camera, localizer.assumed_cameras)
             recorded = replace(images, camera=source, background=scene.bounds.background).open_sequence(sequence)
             recorded = recorded if frames.split is None else recorded.split(frames.split)
-            tracker = Tracker(localizer, tracking.config, start)
-            track(tracker, recorded, every=frames.every, depth=not frames.no_depth, answers=path)
+            tracker = Tracker(localizer, config, start)
+            track(tracker, recorded[: frames.first], every=frames.every, depth=not frames.no_depth, answers=path)
     finally:  # however tracking ended, the frames so far are written
         with defer_interruptions():
             if path:
@@ -130,7 +137,7 @@ def run_track(
                     print_table([""] * 2, path.summary(time.perf_counter() - began))
         if path.lost and all(answer.time is None for answer in path.answers):
             say(
-                f"the frames have no time stamps, so the first ones are assumed to be {tracking.config.frame_seconds:.3g} s"
+                f"the frames have no time stamps, so the first ones are assumed to be {config.frame_seconds:.3g} s"
                 " apart; if they are farther apart, set `frame_seconds`"
             )
         if not path.accepted:

@@ -19,13 +19,14 @@ from bidnerf.cli.options import (
     NewPhotoCamera,
     Overwrite,
     PointChoice,
+    existing,
     installed,
     refuse,
     require_device,
     wrong_usage,
 )
 from bidnerf.cli.output import check_folder, print_result
-from bidnerf.cli.parser import Flag, Group, Option, SettingsGroup
+from bidnerf.cli.parameters import Flag, Group, Option, SettingsGroup
 from bidnerf.cli.running import interruptible_work, report_time
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
@@ -52,7 +53,11 @@ def keypoint_workers(dask: str | None) -> AbstractContextManager[None]:
 
 
 def run_poses(
-    photos: Annotated[Path, Option("PHOTOS", "folder of photos, or a video, without poses", positional=True)],
+    photos: Annotated[
+        Path,
+        Option("PHOTOS", "folder of photos, or a video, without poses", positional=True),
+        existing("photos or a video"),
+    ],
     out: Annotated[Path, Option("DATASET", "folder for the dataset")],
     camera: Annotated[
         Path | None,
@@ -61,6 +66,7 @@ def run_poses(
             "file with the intrinsics of all photos, which are then kept fixed",
             "estimated, starting from EXIF",
         ),
+        existing("a file with the intrinsics"),
     ] = None,
     poser: PoserName = USUAL_POSER,
     dask: DaskAddress = None,
@@ -144,13 +150,16 @@ class DepthPointsOptions:
         Path | None,
         EXPERT,
         Option("MODEL", "COLMAP sparse model whose points provide depth for images without any"),
+        existing("a COLMAP sparse model"),
     ] = None
     model_points: PointChoice = None
 
 
 def run_train(
     data: Annotated[
-        Path, Option("DATA", "folder of a dataset or of photos without poses, or a video", positional=True)
+        Path,
+        Option("DATA", "folder of a dataset or of photos without poses, or a video", positional=True),
+        existing("a dataset, photos or a video"),
     ],
     out: Annotated[Path, Option("MAP", "folder for the map")],
     *,
@@ -165,6 +174,7 @@ def run_train(
             "settings of the backend",
             "The size and the training of the field, for the backend named by --backend.",
             _backend_settings,
+            "backends",
         ),
     ] = None,
 ) -> None:
@@ -177,20 +187,21 @@ def run_train(
     poses, and 2 to 4 minutes of CPU time with --quick. If --out holds a map of landmarks alone, as 'bidnerf import' makes
     of a COLMAP model, it gets a field and a surface.
     """
-    from bidnerf_core.datasets import lacks_poses
-    from bidnerf_core.io import background_colour
-    from bidnerf_core.maps import DESCRIPTION, OtherSettings, TrainOptions, resume, train
-
     resumes, bake = training.resume or training.finish, not target.no_bake
     if resumes and target.overwrite:
         name = "--resume" if training.resume else "--finish"
         raise UsageError(f"{name} continues a map, --overwrite starts a new one; expected only one of them")
     if training.finish and not bake:
         raise UsageError("--finish bakes the map, --no-bake does not; expected only one of them")
+    check_folder(out, (data,), may_be_map=True)
+
+    from bidnerf_core.datasets import lacks_poses
+    from bidnerf_core.io import background_colour
+    from bidnerf_core.maps import DESCRIPTION, OtherSettings, TrainOptions, resume, train
+
     if images.background is not None:
         with wrong_usage():
             background_colour(images.background)
-    check_folder(out, (data,), may_be_map=True)
     require_device(target.device)
     if given_poses.camera != CameraOptions():
         images = replace(images, camera=given_poses.camera.source(images.camera))
@@ -201,7 +212,7 @@ def run_train(
     # A run that was interrupted during pose estimation resumes by itself.
     resumes = resumes and not (photos and not (out / DESCRIPTION).exists())
     if resumes:
-        info = _interrupted(out, training.backend, config, target, given_poses, images)
+        info = _interrupted(out, training.backend, config(), target, given_poses, images)
         images = replace(images, background=images.background or info.bounds.background)
     options = TrainOptions(
         images,
@@ -212,13 +223,24 @@ def run_train(
         given_poses.trust_poses,
         given_poses.poser,
         sparse_depth.depth_points,
-        sparse_depth.model_points,
+        sparse_depth.model_points(),
         training.checkpoint_every,
     )
+
+    def saved() -> str:
+        if not (out / DESCRIPTION).exists():
+            return f"{out}: stopped before anything of the map was saved; the same command starts again"
+        return (
+            f"{out}: stopped; the map keeps its finished parts and the last checkpoint; `resume` continues, `finish` ends"
+            " it as it is"
+        )
+
     with (
         keypoint_workers(training.dask),
         report_time(f"{out}: trained and baked" if bake else f"{out}: trained"),
-        interruptible_work("stopping after this step (Ctrl-C again: at once, back to the last checkpoint)"),
+        interruptible_work(
+            "stopping after this step (Ctrl-C again: at once, back to the last checkpoint)", at_once=saved
+        ),
     ):
         if resumes:
             try:
@@ -226,7 +248,7 @@ def run_train(
             except OtherSettings as error:
                 raise UsageError(error) from error
         else:
-            scene = train(data, training.backend or USUAL_BACKEND, out, config, bake=bake, options=options)
+            scene = train(data, training.backend or USUAL_BACKEND, out, config(), bake=bake, options=options)
     print_result(scene.describe().plain(), (), target.json)
 
 

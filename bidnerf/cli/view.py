@@ -9,7 +9,6 @@ from typing import Annotated
 
 from bidnerf import service, viewer
 from bidnerf.cli.options import (
-    TEST_IMAGES,
     Device,
     Host,
     MapFolder,
@@ -17,12 +16,13 @@ from bidnerf.cli.options import (
     Overwrite,
     Port,
     Queries,
-    SeenImages,
+    QueryImages,
+    existing,
     require_device,
-    require_inputs,
+    require_some,
 )
 from bidnerf.cli.output import check_output, console, say, show
-from bidnerf.cli.parser import Group, Option, Without
+from bidnerf.cli.parameters import Check, Group, Option, Without
 from bidnerf.cli.running import display_progress
 from bidnerf.service import LEAST_TOKEN, ServiceLimits
 from bidnerf.service import serve as serve_maps
@@ -30,6 +30,7 @@ from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.installation import import_extra
 from bidnerf_core.io import read_file
 from bidnerf_core.registry import USUAL_METHOD
+from bidnerf_core.settings import EXPERT
 
 
 @dataclass(frozen=True)
@@ -41,10 +42,14 @@ class PageOptions:
     ] = None
     overwrite: Overwrite = False
     results: Annotated[
-        Path | None, Option("FILE", "results of 'bidnerf evaluate', as a table with links to their frames")
+        Path | None,
+        Option("FILE", "results of 'bidnerf evaluate', as a table with links to their frames"),
+        existing("lines as written by 'bidnerf evaluate'"),
     ] = None
     trajectory: Annotated[
-        Path | None, Option("FILE", "poses from 'bidnerf track', or in the format of TUM, EuRoC or KITTI")
+        Path | None,
+        Option("FILE", "poses from 'bidnerf track', or in the format of TUM, EuRoC or KITTI"),
+        existing("a trajectory"),
     ] = None
 
 
@@ -55,7 +60,7 @@ class ServerOptions:
     host: Host = None
     port: Port = viewer.VIEWER_PORT
     device: Device = "cpu"
-    method: MethodName = USUAL_METHOD
+    method: Annotated[MethodName, EXPERT] = USUAL_METHOD
 
 
 def run_view(
@@ -63,12 +68,13 @@ def run_view(
     query: Annotated[
         tuple[Path, ...],
         Option("[QUERY...]", "photos, folders of photos, or one dataset, to localize and show", positional=True),
+        Check(require_some),
     ] = (),
     *,
     page: Annotated[PageOptions, Group("page", "What the page shows beside the map, and whether it is a file.")],
     server: Annotated[ServerOptions, Group("server", "The server of the page, and how photos are localized there.")],
     queries: Annotated[Queries, Without("rig", "window")],
-    images: SeenImages = TEST_IMAGES,
+    images: QueryImages,
 ) -> None:
     """View a map, and localizations in it, in a browser.
 
@@ -84,7 +90,6 @@ def run_view(
         check_output(page.save, (*query, *queries.depth, page.results, page.trajectory), page.overwrite)
     else:
         viewer.require_viewer()
-    require_inputs(page.results, page.trajectory)
     opener = queries.opener(query, images) if query else None
     say(f"loading {map}")
 

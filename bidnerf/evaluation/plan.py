@@ -238,6 +238,7 @@ class Plan(Setup, Settings):
     )
     seed: Annotated[int, WholeNumbers(0, LARGEST_SEED)] | None = None
     frames: Sequence[str] | None = None  # use only these
+    first: Annotated[int, WholeNumbers(1)] | None = None  # use only the first ones, in the order of the dataset
     faults: Sequence[str] = (NO_FAULT,)  # each is applied to the same frames from the same starts
 
     def __post_init__(self) -> None:
@@ -295,7 +296,7 @@ def list_trials(plan: Plan, map: str, data: str, dataset: Capture) -> list[Trial
         others = {split: dataset.frame_names(split) for split in dataset.splits}
         elsewhere = describe_other_split(name, others) or f"no frame {name!r}"
         raise InputError(f"split {split!r}: {elsewhere}", where=data)
-    chosen = [name for name in names if plan.frames is None or name in plan.frames]
+    chosen = [name for name in names if plan.frames is None or name in plan.frames][: plan.first]
     hidden = [name for name in dataset.hidden_frames(split) if name in chosen]
     visible = [name for name in chosen if name not in hidden]
     if hidden:

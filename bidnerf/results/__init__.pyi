@@ -3,7 +3,6 @@ from .answers import Answer as Answer
 from .answers import Answers as Answers
 from .answers import Failure as Failure
 from .answers import plain_localization as plain_localization
-from .colmap_poses import check_pose_file as check_pose_file
 from .errors import CRITERIA as CRITERIA
 from .errors import PoseError as PoseError
 from .errors import Rate as Rate
@@ -41,11 +40,12 @@ from .pose_files import LandmarkMatches as LandmarkMatches
 from .pose_files import PosedImage as PosedImage
 from .pose_files import common_unit as common_unit
 from .pose_files import pose_entries as pose_entries
-from .pose_files import pose_format as pose_format
 from .pose_files import pose_of as pose_of
 from .pose_files import read_pose as read_pose
 from .pose_files import read_poses as read_poses
 from .pose_files import read_positions as read_positions
-from .pose_files import refused_file as refused_file
 from .pose_files import write_poses as write_poses
+from .pose_formats import check_pose_file as check_pose_file
+from .pose_formats import pose_format as pose_format
+from .pose_formats import refused_file as refused_file
 from .tracking import track as track

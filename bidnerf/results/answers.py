@@ -22,7 +22,8 @@ from bidnerf.results.errors import (
     within,
 )
 from bidnerf.results.plots import draw_path
-from bidnerf.results.pose_files import LandmarkMatches, PosedImage, pose_format, refused_file, write_poses
+from bidnerf.results.pose_files import LandmarkMatches, PosedImage, write_poses
+from bidnerf.results.pose_formats import pose_format, refused_file
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.captures import UpDirection, given_cameras
 from bidnerf_core.errors import InputError, amount

@@ -17,31 +17,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf.results.pose_files import PosedImage, frame_of, pose_format
+from bidnerf.results.pose_files import PosedImage, frame_of
+from bidnerf.results.pose_formats import HEAD, check_pose_file
 from bidnerf_core.camera import Intrinsics, colmap_model
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.io import write_file
 
-HEAD = "# written by bidnerf"
 SAME_CAMERA = 0.5
 """Pixels by which cameras differ that are written as one: localization estimates a photo's own camera, with an error of its own."""
-
-
-def check_pose_file(path: Path) -> None:
-    """Check that a pose file may be written under this name, before any work is done.
-
-    Raises ``UsageError`` for a name without the ending of a known format, and ``InputError`` for an
-    images.txt next to another program's cameras.txt or points3D.txt, which would be overwritten.
-    """
-    if pose_format(path) != "images.txt":
-        return
-    for beside in (path.with_name("cameras.txt"), path.with_name("points3D.txt")):
-        if beside.exists() and HEAD not in beside.read_text(errors="replace")[:100]:
-            raise InputError(
-                "would be replaced, since a COLMAP model has one;",
-                where=beside,
-                expected=f"{path.name} in a folder without another model",
-            )
 
 
 def write_colmap_poses(path: Path, images: Sequence[PosedImage], refused: Sequence[str] = ()) -> None:

@@ -10,22 +10,21 @@ import json
 import math
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from bidnerf.results.pose_formats import POSE_WRITERS, pose_format, refused_file
 from bidnerf_core.camera import UPRIGHT, Intrinsics, Orientation, read_exif
 from bidnerf_core.datasets import frame_entry
-from bidnerf_core.errors import InputError, UsageError, printable, spelling_hint
+from bidnerf_core.errors import InputError, printable, spelling_hint
 from bidnerf_core.geometry import SE3, LengthUnit, pose_from_matrix
 from bidnerf_core.io import parse_json, read_file, write_file
-from bidnerf_core.registry import Plugins, interface_defects
 
 OPENCV_AXES = "camera axes x right, y down, z forward (OpenCV)"
 EXPECTED_POSE = '{"T_world_camera": 4x4 rows}'
@@ -178,34 +177,6 @@ def write_pose_transforms(path: Path, images: Sequence[PosedImage], **more: Any)
     write_file(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
 
 
-PoseWriter: TypeAlias = Callable[[Path, Sequence[PosedImage]], None]
-"""A function that writes poses to a file atomically.
-
-If it takes ``refused`` as well, it also gets a line of text for each image without an accepted pose, for comments.
-"""
-
-POSE_WRITERS: Plugins[PoseWriter] = Plugins(
-    "writers", partial(interface_defects, attributes=(), methods={"__call__": ("path", "images")})
-)
-"""Writers by file-name ending; if several match, the longest ending is used.
-
-The first line of a writer's docstring describes its format in lists. ``list_plugins("writers")`` lists the endings without
-importing the writers.
-"""
-
-
-def pose_format(path: Path) -> str:
-    """Return the file-name ending that selects the format of a pose file.
-
-    Raises ``UsageError`` for a name without a known ending.
-    """
-    ending = max((e for e in POSE_WRITERS if path.name.lower().endswith(e)), key=len, default=None)
-    if ending is None:
-        found = f"no format of poses has the ending {path.suffix}" if path.suffix else "has no ending"
-        raise UsageError(found, where=path, expected=f"a name that ends with {', '.join(POSE_WRITERS)}")
-    return ending
-
-
 def write_poses(path: str | Path, images: Sequence[PosedImage], refused: Sequence[str] = ()) -> None:
     """Write poses in the format selected by the file-name ending.
 
@@ -227,11 +198,6 @@ def write_poses(path: str | Path, images: Sequence[PosedImage], refused: Sequenc
     beside = refused_file(path)
     if refused or beside.exists():
         write_file(beside, "".join(f"{printable(each)}\n" for each in refused).encode())
-
-
-def refused_file(path: Path) -> Path:
-    """Return the file beside a pose file that names the images without an accepted pose."""
-    return path.with_name(f"{path.name[: -len(path.suffix)]}.refused.txt")
 
 
 def read_pose(path: str | Path) -> SE3:

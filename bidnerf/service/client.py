@@ -74,7 +74,12 @@ class ServiceClient:
                     parts.append(_part(edge, name, file, name))
                 elif file is not None:
                     parts.append(_part(edge, name, Path(file).read_bytes(), Path(file).name))
-        except (OSError, TypeError, ValueError) as error:
+        except OSError as error:
+            expected = "the name of a file, or its content as bytes"
+            raise ServiceError(
+                0, f"{error.filename}: cannot be read ({error.strerror}), expected {expected}"
+            ) from error
+        except (TypeError, ValueError) as error:
             raise ServiceError(0, f"the request cannot be made: {error}") from error
         body = b"".join(parts) + f"--{edge}--\r\n".encode()
         return self.ask("/localize", body, f"multipart/form-data; boundary={edge}")

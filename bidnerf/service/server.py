@@ -160,7 +160,7 @@ def run_app(
 
 
 def maps_by_name(scenes: Scenes) -> dict[str, Path]:
-    """Return the folders of maps by name. Raises ``UsageError`` for names that are invalid or not unique.
+    """Return the folders of maps by name; that of a link is the link's own. Raises ``UsageError`` for names that are invalid or not unique.
 
     ``bidnerf_core.maps.name_maps`` would make equal names unique by parent folders, but not into names for a URL.
     """
@@ -171,7 +171,7 @@ def maps_by_name(scenes: Scenes) -> dict[str, Path]:
         for scene in map(str, [scenes] if isinstance(scenes, str | Path) else scenes):
             name, equals, path = scene.partition("=")
             is_named = equals and not Path(scene).is_dir()  # a folder's own name may contain an equals sign
-            pairs.append((name, path) if is_named else (Path(scene).resolve().name, scene))
+            pairs.append((name, path) if is_named else (os.path.basename(os.path.abspath(scene)), scene))
     if not pairs:
         raise UsageError("no MAP", expected="folders of maps")
     names = [name for name, _ in pairs]

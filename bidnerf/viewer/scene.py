@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -47,7 +48,7 @@ def map_json(scene: Map, thumbnails: int = 60) -> JsonObject:
     some = _subset(0 if landmarks is None else len(landmarks), 20_000)
     every = max(1, math.ceil(len(scene.info.cameras) / max(thumbnails, 1)))
     return {
-        "name": scene.folder.resolve().name if scene.folder is not None else "map in memory",
+        "name": "map in memory" if scene.folder is None else os.path.basename(os.path.abspath(scene.folder)),
         "facts": _facts(scene),
         "unit": symbol(scene.unit),
         "up": (0.0, 0.0, 1.0) if up is None else up.direction,

@@ -172,7 +172,8 @@ def pose_sentences(cameras: Sequence[StoredCamera], refinement: PoseRefinement) 
             f"the poses are refined by {metres:.3g} and {degrees:.2g}° or {pixels:.1f} px (median), most for {moved[0]}"
         )
     lines = [
-        f"{cause} add {refinement.inconsistency:.2f} px to the {refinement.noise_after:.2f} px by which keypoints scatter; {result}"
+        f"{cause} amount to {refinement.inconsistency:.2f} px in the images, where keypoints alone scatter by"
+        f" {refinement.noise_after:.2f} px; {result}"
     ]
     if len(motions):
         metres, radians = (median(part.norm(dim=-1).tolist()) for part in motions.split(3, dim=-1))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias, Union
 
 from bidnerf_core.errors import InputError, UsageError
-from bidnerf_core.settings import EXPERT, WholeNumbers
+from bidnerf_core.settings import EXPERT, FARTHEST, WholeNumbers
 
 if TYPE_CHECKING:
     from bidnerf_core.camera import Camera, CameraSource
@@ -66,13 +66,10 @@ class DatasetOptions:
             raise UsageError(
                 f"`mask_hides` {self.mask_hides} was given without `masks`", expected="the folder of masks"
             )
-        if self.depth_unit is not None:
-            from bidnerf_core.depth import FARTHEST
-
-            if not 0 < self.depth_unit <= FARTHEST:
-                raise InputError(
-                    f"depth_unit is {self.depth_unit:g}", expected="a positive number of metres per step, such as 0.001"
-                )
+        if self.depth_unit is not None and not 0 < self.depth_unit <= FARTHEST:
+            raise InputError(
+                f"depth_unit is {self.depth_unit:g}", expected="a positive number of metres per step, such as 0.001"
+            )
 
     def open(self, path: str | Path, readers: Sequence[Reader] | None = None) -> Capture:
         """Open the dataset in the folder ``path``.

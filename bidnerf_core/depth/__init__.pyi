@@ -1,4 +1,3 @@
-from .images import FARTHEST as FARTHEST
 from .images import MILLIMETRE as MILLIMETRE
 from .images import DepthImage as DepthImage
 from .images import DepthReader as DepthReader

@@ -16,9 +16,8 @@ from torch import Tensor
 
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.io import decode, read_array, to_numpy
+from bidnerf_core.settings import FARTHEST
 
-FARTHEST = 1e9
-"""Largest depth (metres) that counts as measured: no sensor reaches farther."""
 NOTHING = 1e10
 """Floating-point values from here on mean "not measured" in any unit, such as Blender's 1e10 and the largest float."""
 MILLIMETRE = 0.001

@@ -2,6 +2,8 @@ from .allowance import Allowance as Allowance
 from .archives import Archive as Archive
 from .databases import open_arrays as open_arrays
 from .databases import read_database_table as read_database_table
+from .files import HEIF_SUFFIXES as HEIF_SUFFIXES
+from .files import IMAGE_SUFFIXES as IMAGE_SUFFIXES
 from .files import FileInUse as FileInUse
 from .files import PackedFile as PackedFile
 from .files import available_memory as available_memory
@@ -17,8 +19,6 @@ from .files import take_lock as take_lock
 from .files import usable_cores as usable_cores
 from .files import write_file as write_file
 from .images import COLOUR_ROUNDING as COLOUR_ROUNDING
-from .images import HEIF_SUFFIXES as HEIF_SUFFIXES
-from .images import IMAGE_SUFFIXES as IMAGE_SUFFIXES
 from .images import LARGEST_IMAGE as LARGEST_IMAGE
 from .images import Background as Background
 from .images import ImageSource as ImageSource

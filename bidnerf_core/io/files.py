@@ -20,6 +20,8 @@ from bidnerf_core.errors import InputError
 LARGEST_TEXT = 128 * 2**20
 """Default limit on the size of a file (bytes). Parsed text takes ten times as much memory as its file, so the size is checked
 before reading."""
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
+HEIF_SUFFIXES = (".heic", ".heif", ".hif")
 
 
 @dataclass(frozen=True)

@@ -37,8 +37,6 @@ STRIP = 2**21
 FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "AVIF", "HEIF")
 """The formats that are decoded, whatever a file's name. Pillow supports more, and reads EPS by starting
 another program."""
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
-HEIF_SUFFIXES = (".heic", ".heif", ".hif")
 CONVERTED = ("CMYK", "YCbCr", "HSV")
 """Colour spaces that Pillow converts to RGB."""
 

@@ -1,6 +1,5 @@
 from .collection import MapCollection as MapCollection
 from .collection import Placement as Placement
-from .collection import maps_in as maps_in
 from .collection import name_maps as name_maps
 from .description import Anchor as Anchor
 from .description import MapInfo as MapInfo
@@ -8,6 +7,7 @@ from .description import cameras_of as cameras_of
 from .description import load_info as load_info
 from .description import longest_side as longest_side
 from .description_file import DESCRIPTION as DESCRIPTION
+from .description_file import maps_in as maps_in
 from .description_file import read_description as read_description
 from .extending import extend as extend
 from .importers import IMPORTERS as IMPORTERS

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +23,7 @@ from bidnerf_core.geometry import SE3
 from bidnerf_core.localization import USUAL_METHOD, VOTERS, Localization, Outcome, Verdict, localize_by_landmarks
 from bidnerf_core.mapping import CachedFeatures, DescriptorCells, InvertedFile, LandmarkMap, detect, find_features
 from bidnerf_core.maps.description import load_info
-from bidnerf_core.maps.description_file import DESCRIPTION
+from bidnerf_core.maps.description_file import maps_in
 from bidnerf_core.maps.localizer import Localizer
 from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.maps.scene import origin_of, unit_of
@@ -253,13 +254,6 @@ class MapCollection:
         return replace(found, unit=unit_of(localizer.scene)).translated(origin_of(localizer.scene))
 
 
-def maps_in(folder: Path) -> list[Path]:
-    """Return the folder itself if it is a map, else its subfolders that are maps, by name."""
-    if (folder / DESCRIPTION).exists():
-        return [folder]
-    return sorted(path.parent for path in folder.glob(f"*/{DESCRIPTION}"))
-
-
 def name_maps(scenes: Sequence[_Scene]) -> dict[str, _Scene]:
     """Return maps by name: that of the folder, with as many parent folders as are needed to make it unique.
 
@@ -270,10 +264,10 @@ def name_maps(scenes: Sequence[_Scene]) -> dict[str, _Scene]:
     for scene in scenes:
         folder = scene.folder if isinstance(scene, Map) else Path(scene)
         if folder is not None:
-            paths.append(folder.resolve().parts)
+            paths.append(Path(os.path.abspath(folder)).parts)  # a link keeps its own name
         elif isinstance(scene, Map):
             paths.append((scene.info.backend, scene.info.data or "map"))
-        identity = id(scene) if folder is None else paths[-1]
+        identity = id(scene) if folder is None else folder.resolve()
         if identity in known:
             raise UsageError(f"two maps are named {paths[-1][-1]!r}", expected="each map once")
         known.add(identity)

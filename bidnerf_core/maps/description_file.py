@@ -1,4 +1,4 @@
-"""The file ``map.json`` of a map, as JSON; reading it needs no torch."""
+"""The file ``map.json`` of a map, as JSON; finding and reading it needs no torch."""
 
 from __future__ import annotations
 
@@ -34,3 +34,10 @@ def read_description(folder: Path) -> dict[str, Any]:
             InputError(f"version {found.get('version')!r}", where=path, expected=expected), found.get("bidnerf")
         )
     return found
+
+
+def maps_in(folder: Path) -> list[Path]:
+    """Return the folder itself if it is a map, else its subfolders that are maps, by name."""
+    if (folder / DESCRIPTION).exists():
+        return [folder]
+    return sorted(path.parent for path in folder.glob(f"*/{DESCRIPTION}"))

@@ -211,7 +211,7 @@ class Tracker:
         motion = self._at(frame, found.T_world_camera, found.covariance)
         measured = self._measure(frame, image, state, motion)
         if measured is not None and measured.answer.converged:
-            reason, state = f"{reason}; {measured.answer.reason}", measured.state
+            state = measured.state
         return replace(found, reason=reason, covariance=motion.covariance), self._advance(frame, image, motion, state)
 
     def _corners(self, frame: Frame, image: Grey | None, points: Points, T_world_camera: SE3) -> Points:

@@ -182,7 +182,7 @@ def _read_dataset(data: Capture, split: str, largest: int | None, folder: Path |
         log.info(f"{where}: {amount(left_out, 'image')} left out, being entirely hidden; {INVERTED}")
     if not views:
         raise InputError(f"masks hide every image in split {split!r} entirely; {INVERTED}", where=where)
-    source, folder = data.path.resolve().name, data.path if data.path.is_dir() else data.path.parent
+    source, folder = os.path.basename(os.path.abspath(data.path)), data.path if data.path.is_dir() else data.path.parent
     files = {shot.name: shot.file for shot in shots if shot.file is not None}
     once = Counter(files.values())
     return ReadViews(

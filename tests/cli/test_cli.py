@@ -8,6 +8,7 @@ import math
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -115,6 +116,18 @@ def test_the_frames_that_are_asked_for_are_judged_and_no_others(
     assert_refused(bidnerf(*arguments, "r_0000", "r_0001"), 1, data / damaged)
     assert not (tmp_path / "out").exists()
     assert bidnerf(*arguments, "r_0000").status == 0
+
+
+def test_the_first_images_of_a_dataset_or_of_photos_are_used(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
+    place, first = (shared / "map", shared / "data"), ("--first", 2)
+    rendered = bidnerf("render", *place, "--out", tmp_path / "out", *first).succeed().out
+    assert [line.split()[0] for line in rendered.splitlines()] == ["t_0000", "t_0001", "mean"]
+    for more, expected in (
+        ((), ["t_0000", "t_0001"]),
+        (("--frame", "t_0002", "t_0000", "t_0001"), ["t_0002", "t_0000"]),
+    ):
+        found = bidnerf("localize", *place, *QUICK, *first, *more, "--json").succeed().out
+        assert [json.loads(line)["frame"] for line in found.splitlines()] == expected
 
 
 def test_without_depth_colour_alone_is_used_and_that_is_said(bidnerf: Run, photos_only: Path, tmp_path: Path) -> None:
@@ -508,6 +521,39 @@ def test_ctrl_c_saves_and_resuming_loses_nothing(
     assert "resuming from step 5" in resumed.err
     assert sorted(file.suffix for file in half.iterdir()) == [".json", ".safetensors"]
     assert_same_map(half, whole)
+
+
+def test_another_signal_says_what_is_kept_and_how_to_go_on(
+    bidnerf: Run, data: Path, interrupted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C waits for the next step of the work; SIGTERM and a second Ctrl-C do not."""
+
+    def stop(*_: Any, **more: Any) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr("bidnerf_core.maps.training.bake_if_possible", stop)
+    monkeypatch.setattr("bidnerf.scenes.views", stop, raising=False)
+    monkeypatch.setattr("bidnerf_core.maps.training.read_views", stop)
+    demo, new = tmp_path / "demo", tmp_path / "new"
+    for command, line in (
+        (
+            ["train", data, "--out", interrupted, "--finish"],
+            f"{interrupted}: stopped; the map keeps its finished parts and the last checkpoint; --resume continues,"
+            " --finish ends it as it is",
+        ),
+        (
+            ["demo", "--out", demo],
+            f"stopped; the demo cannot be continued, 'bidnerf demo --out {demo} --overwrite' starts again",
+        ),
+        (
+            ["train", data, "--out", new],
+            f"{new}: stopped before anything of the map was saved; the same command starts again",
+        ),
+    ):
+        stopped = bidnerf(*command)
+        assert (stopped.status, stopped.err.splitlines()[-2:]) == (143, [line, f"bidnerf {command[0]}: interrupted"])
+    monkeypatch.undo()
+    bidnerf("train", data, "--out", interrupted, "--resume", "--no-bake").succeed()
 
 
 def test_ctrl_c_before_anything_is_made_leaves_nothing(

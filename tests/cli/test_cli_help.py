@@ -16,7 +16,8 @@ import pytest
 
 # Inside: the parser alone, and the options of all commands by name
 from bidnerf.cli import COMMANDS, parser
-from bidnerf.cli.parser import FLAG, Group, Option, SettingsGroup, Without, parse
+from bidnerf.cli.parameters import FLAG, Group, Option, SettingsGroup, Without
+from bidnerf.cli.parser import parse
 from bidnerf.evaluation import PROTOCOLS
 from bidnerf_core.errors import UsageError
 from bidnerf_core.localization import METHODS

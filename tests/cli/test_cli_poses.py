@@ -63,8 +63,8 @@ def test_a_map_holds_refined_and_given_poses(bidnerf: Run, refined: Path, views:
         torch.testing.assert_close((view.T_ref_camera.inverse() @ T).log(), UPDATE, rtol=0, atol=1e-9)
     shown = bidnerf("info", refined).out
     assert (
-        f"0.60 px to the 0.36 px by which keypoints scatter; the poses are refined by {UPDATE[:3].norm():.3g} and"
-        in shown
+        "amount to 0.60 px in the images, where keypoints alone scatter by 0.36 px; the poses are refined by"
+        f" {UPDATE[:3].norm():.3g} and" in shown
     )
     assert f"by the landmarks of the other images: {views[1].frame.name} by" in shown
     facts = json.loads(bidnerf("info", refined, "--json").out)

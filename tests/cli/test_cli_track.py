@@ -115,6 +115,8 @@ def test_one_split_of_a_dataset_is_tracked(bidnerf: Run, tmp_path: Path) -> None
     track = ("track", "MAP", tmp_path / "data", "--out", tmp_path / "path.json", "--overwrite", "--split")
     bidnerf(*track, "test").succeed()
     assert len(json.loads((tmp_path / "path.json").read_text())) == 2
+    bidnerf(*track, "test", "--first", 1).succeed()
+    assert [row["frame"] for row in json.loads((tmp_path / "path.json").read_text())] == [named[1].frame.name]
     assert_refused(bidnerf(*track, "val"), 1, tmp_path / "data", "'val'", "train, test", after_remarks=True)
 
 

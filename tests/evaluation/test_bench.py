@@ -75,6 +75,7 @@ def test_a_plan_is_its_protocol_for_each_size() -> None:
     assert trials_of(seed=5)[0].seed == 5
     few = trials_of(sizes=[0.9], trials=5, frames=["0003", "0007"])
     assert sorted({t.frame for t in few}) == ["0003", "0007"]
+    assert sorted({t.frame for t in trials_of(sizes=[0.9], trials=5, first=2)}) == ["0000", "0001"]
     (odd,) = trials_of(sizes=[[0.1]], trials=1, device="cpu:0", depth=False)
     assert (odd.device, odd.depth) == ("cpu:0", False)
 

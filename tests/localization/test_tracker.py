@@ -131,6 +131,8 @@ def test_a_camera_that_is_carried_elsewhere_is_lost_and_found() -> None:
     answers = tracked(frames)
     assert_honest(answers, frames)
     assert_right(answers[5:], frames[5:])
+    counts = [answer.reason.count("landmark inliers") for answer in answers]
+    assert (counts[0], max(counts)) == (1, 1)  # those of the pose, and not of the tracker's own measurement as well
 
 
 def test_in_a_foreign_scene_no_pose_is_accepted_and_odometry_continues() -> None:

@@ -22,7 +22,7 @@ from bidnerf.evaluation import (
     read_runs,
 )
 from bidnerf.results import Answer, Answers, PosedImage, new_figure, write_figure
-from bidnerf.results.pose_files import POSE_WRITERS
+from bidnerf.results.pose_formats import POSE_WRITERS
 from bidnerf_core.captures import write_inria_cameras
 from bidnerf_core.io import is_temporary, write_file
 

@@ -171,6 +171,10 @@ def test_folders_of_one_name_are_told_apart_by_those_around_them(
     assert list(name_maps([memory, replace(memory)])) == ["ground/other", "ground/other-2"]
     with refused(found="two maps are named 'MAP'", expected="each map once"):
         bn.MapCollection([folders[0], folders[1], folders[0]])
+    (tmp_path / "today").symlink_to(folders[0])
+    assert list(name_maps([tmp_path / "today", folders[-1]])) == ["today", "other"]  # a link keeps its own name
+    with refused(found="two maps are named 'MAP'", expected="each map once"):
+        name_maps([tmp_path / "today", folders[0]])
 
 
 def test_the_command(bidnerf: Run, grounds: list[Map], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -581,7 +581,9 @@ def test_the_client_asks_a_server(inputs: Inputs, service: Service) -> None:
     assert client.localize(pixels[..., 0], "map", depth=depth, focal=32, start=start)["frame"] == "photo"
     with pytest.raises(ServiceError, match="float64"):
         client.localize(pixels / 2, "map")
-    for wrong in ({"photo": inputs.folder / "none.png"}, {"start": object()}, {"camera": 7}, {"name": "\ud800"}):
+    with pytest.raises(ServiceError, match=r"none.png: cannot be read \(No such .*\), expected the name of a file"):
+        client.localize(inputs.folder / "none.png")
+    for wrong in ({"start": object()}, {"camera": 7}, {"name": "\ud800"}):
         with pytest.raises(ServiceError, match="the request cannot be made: "):
             client.localize(**{"photo": b"", **wrong})
     assert set(client.maps()) == {"map", "hall"}
@@ -752,6 +754,8 @@ def test_maps_and_settings_that_cannot_be_served_are_refused(tmp_path: Path, bid
     assert_refused(bidnerf("serve", tmp_path, "--port", 0), 1, tmp_path, "expected a map")
     assert maps_by_name({"a": "x"}) == maps_by_name(["a=x"]) == {"a": Path("x")}
     assert list(maps_by_name(["x/a", "b=y/a"])) == ["a", "b"]
+    (tmp_path / "today").symlink_to(tmp_path)
+    assert list(maps_by_name([tmp_path / "today"])) == ["today"]  # a link's own name, not its target's
     for maps, part in (
         ([], "no MAP"),
         ({"a/b": "x"}, "its name is 'a/b'"),
