@@ -319,19 +319,21 @@ def run_extend(
     is replaced only when everything is done: after Ctrl-C, or a kill, it is unchanged, and localizers may keep reading it
     meanwhile.
     """
-    from bidnerf_core.datasets import find_reader
+    from bidnerf_core.datasets import Photos, find_reader, photo_files
     from bidnerf_core.maps import extend, load_info
 
     require_device(device)
     info = load_info(map)
-    given = {"--camera": images.camera, "--register-depth": images.register_depth, "--depth-unit": images.depth_unit}
-    is_stated = any(value is not None for value in given.values())
+    of_depth = {"--register-depth": images.register_depth, "--depth-unit": images.depth_unit}
+    is_stated = any(value is not None for value in (images.camera, *of_depth.values()))
     paths = [new] if data is None else [new, data]
     datasets = [path for path in paths if is_stated and find_reader(path) is not None]
     if not datasets:
-        refuse(given, f"is for a dataset, but {new} is none; leave it out")
+        refuse(of_depth, f"is for a dataset, but {new} is none; leave it out")
     options = replace(images, background=info.bounds.background)
     opened: dict[Path, Path | Capture] = {path: options.open(path) for path in datasets}
+    if images.camera is not None and new not in datasets:
+        opened[new] = Photos(photo_files([new]), options).capture
     known = None if data is None else opened.get(data, data)
     with interruptible_work(kept=f"stopped; {map} is unchanged"):
         scene = extend(

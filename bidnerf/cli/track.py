@@ -140,7 +140,7 @@ def run_track(
                 f"the frames have no time stamps, so the first ones are assumed to be {config.frame_seconds:.3g} s"
                 " apart; if they are farther apart, set `frame_seconds`"
             )
-        if not path.accepted:
+        if path and not path.accepted:
             say(f"no pose of {amount(len(path), 'frame')} was accepted")
     if path.unread:
         raise InputError(f"{path.unread} of {path.unread + len(path)} frames could not be read, see above")

@@ -146,7 +146,8 @@ def _parse(path: Path, content: bytes) -> tuple[list[TrialResult], int]:
             try:
                 results.append(from_plain(TrialResult, plain, where))
             except InputError as error:
-                raise with_writer(error, *_writers(path)) from error
+                stated = InputError(error, expected=error.expected or EXPECTED_RESULTS)
+                raise with_writer(stated, *_writers(path)) from error
         length += len(line) + (number < len(lines))
     return results, length
 

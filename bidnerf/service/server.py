@@ -150,7 +150,9 @@ def run_app(
         listening = socket.create_server((host, port), family=family)
     except (OSError, OverflowError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise InputError(f"cannot listen there ({reason}); choose another port", where=f"{host}:{port}") from error
+        raise InputError(
+            f"cannot listen there ({reason}); choose another port or address", where=f"{host}:{port}"
+        ) from error
     with listening:
         try:
             asyncio.run(run(listening))

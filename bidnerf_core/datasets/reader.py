@@ -323,7 +323,7 @@ def no_dataset(path: Path, readers: Sequence[Reader] | None = None, or_else: str
             )
         if looks_like_image(path):
             return InputError(
-                "is a single photo, of which no map can be made",
+                "is a single photo" if or_else else "is a single photo, of which no map can be made",
                 where=path,
                 expected="a folder of photos of the scene from several places, a video, or the folder of a dataset",
             )

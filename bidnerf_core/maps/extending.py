@@ -162,7 +162,7 @@ def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], lis
     frames, unread = list[Any](), list[LeftOutPhoto]()
     source: Sequence[Frame] | Sequence[View] | Capture
     if not isinstance(photos, str | Path):
-        source = photos.split(split) if isinstance(photos, Capture) else photos
+        source = photos.split(split) if isinstance(photos, Capture) and photos.splits else photos
     elif (path := Path(photos)).is_dir() and find_reader(path) is not None:
         source = open_dataset(path, background).split(split)
     else:

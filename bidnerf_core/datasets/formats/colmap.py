@@ -99,7 +99,10 @@ def colmap_project(
     Images are in natural name order, cameras are keyed by id, and existing files are keyed by image name.
     Raises ``InputError`` if the model is damaged or has no registered image.
     """
-    model, images, cameras = _largest(path, colmap_models(path))
+    models = colmap_models(path)
+    if not models:
+        raise InputError("no COLMAP model in it", where=path, expected="the folder of a COLMAP project or model")
+    model, images, cameras = _largest(path, models)
     folder, files = _image_folder(path, model, images, given)
     others = _models_at(folder.parent / "sparse") if files and given is None else []
     if others and model.resolve() not in [each.resolve() for each in others]:
