@@ -159,6 +159,7 @@ def test_an_interrupted_command_advises_what_it_can_do(
         raise Cancelled("map: saved after step 3; `resume` continues from there")
 
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "FILE").touch()
     monkeypatch.setattr(place, stopped)
     monkeypatch.setattr("bidnerf.cli.demo.TRAINING_VIEWS", 2)
     status, _, err = bidnerf(*words)
