@@ -17,7 +17,7 @@ from typing import Annotated, Any, TypeVar
 from bidnerf.cli.program import option_name
 from bidnerf_core.errors import spelled
 
-T = TypeVar("T")
+Note = TypeVar("Note")
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class Parameter:
     default: Any  # MISSING if it is required
     doc: str
 
-    def note(self, kind: type[T]) -> T | None:
+    def note(self, kind: type[Note]) -> Note | None:
         """Return the last annotation of type ``kind``, or None if there is none."""
         return next((note for note in reversed(self.notes) if isinstance(note, kind)), None)
 

@@ -71,16 +71,17 @@ def test_a_missing_extra_is_named_before_any_work(
     needed: tuple[str, str], line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bidnerf: Run
 ) -> None:
     extra, module = needed
-    data, photos = tmp_path / "data", tmp_path / "photos"
-    data.mkdir()
-    photos.mkdir()
+    data, photos, described = tmp_path / "data", tmp_path / "photos", tmp_path / "map"
+    for folder in (data, photos, described):
+        folder.mkdir()
+    (described / "map.json").write_text('{"format": "bidnerf map", "version": 1}')
     (data / "clip.mp4").write_bytes(VIDEO)
     (data / "IMG_1.jpg").write_bytes(HEIC)
     (data / "r.jsonl").write_text("")
     (photos / "a.png").write_bytes(png_of(64, 48))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, module, None)
-    places = {"MAP": tmp_path / "map", "DATA": data, "PHOTOS": photos}
+    places = {"MAP": described, "DATA": data, "PHOTOS": photos}
     words = [re.sub(r"^[A-Z]+(?=/|$)", lambda name: str(places[name[0]]), word) for word in line.split()]
     assert_refused(bidnerf(*words), 1, f"needs the extra '{extra}' (pip install 'bidnerf[{extra}]')")
     assert not list(tmp_path.glob("x*"))
