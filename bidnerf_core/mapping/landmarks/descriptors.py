@@ -42,11 +42,12 @@ def byte_of_zero(descriptors: UInt8[Tensor, "n d"]) -> int:
     It is the centre of the sphere on which the descriptors lie: the byte ``z`` that minimizes the variance of the squared norms of
     ``descriptors - z``.
     """
-    parts = [part.double() for part in descriptors.split(MANY)]
-    sums = torch.cat([part.sum(1) for part in parts]) if parts else torch.zeros(0, dtype=torch.float64)
-    if not len(sums) or float(sums.var(unbiased=False)) == 0:
+    if not len(descriptors):
         return 0
-    squares = torch.cat([part.square().sum(1) for part in parts])
+    values = (part.double() for part in descriptors.split(MANY))  # in turn, as all would take gigabytes
+    sums, squares = map(torch.cat, zip(*((part.sum(1), part.square().sum(1)) for part in values), strict=True))
+    if float(sums.var(unbiased=False)) == 0:
+        return 0
     slope = ((squares - squares.mean()) * (sums - sums.mean())).mean() / sums.var(unbiased=False)
     return round(min(255.0, max(0.0, float(slope) / 2)))
 
