@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 from _lab import Row, parser, record, within
-from answers import answers_of, read_rows
+from answers import answers_of, judged_anew, read_rows
 from confidence import STORED
 from scipy.stats import beta
 
@@ -70,12 +70,12 @@ def calibrate(rows: Sequence[Row]) -> Thresholds:
 
 
 def examples(paths: Iterable[Path]) -> tuple[list[Row], int]:
-    """Return each accepted answer by landmarks once, and the number of the other accepted answers."""
+    """Return each answer by landmarks once that the present bounds accept, and the number of the other accepted answers."""
     rows = {}
     for path in paths:
         for key, row in answers_of(read_rows(path)).items():
             names = dict(zip(("scene", "mode", "fault", "frame"), key, strict=True))
-            rows[key] = row | names | {"diagnostics": row.get("evidence")}
+            rows[key] = judged_anew(row) | names | {"diagnostics": row.get("evidence")}
     accepted = [row for row in rows.values() if row["converged"]]
     known = [row for row in accepted if row["diagnostics"] is not None and row["confidence"] is not None]
     return known, len(accepted) - len(known)

@@ -99,7 +99,10 @@ def unseen() -> View:
 def textured_map(surface: bool = False) -> MapWithLandmarks:
     if surface:
         return replace(textured_map(), surface=bake(ground(), BOUNDS, [], training_views(), BakeConfig(cells=200_000)))
-    return MapWithLandmarks(ground(), BOUNDS, build_landmarks(training_views()))
+    # As a trial of a map on its own images finds them; those of a map without a trial are far more cautious.
+    scatter = torch.full((4,), 0.004, dtype=torch.float64)
+    landmarks = replace(build_landmarks(training_views()), correlation=3.0, calibration_scatter=scatter)
+    return MapWithLandmarks(ground(), BOUNDS, landmarks)
 
 
 T_MOVED_WORLD = SE3(
