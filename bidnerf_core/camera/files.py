@@ -97,6 +97,8 @@ CAMERA_FORMATS = (
 """The files of cameras that are read, for messages."""
 OWN_KEYS = {"fx", "fy", "cx", "cy", "width", "height", "distortion"}
 """The keys of ``Intrinsics`` as JSON, with pixel centres at +0.5."""
+MOST_LINES = 100_000
+"""Maximum number of lines of a text file of cameras, which take some seconds to read."""
 
 
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
@@ -175,6 +177,8 @@ def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> 
         return parse_calibration(str(path), parse_yaml(content, str(path), CAMERA_FORMATS), size)
     if start[:1] == b"<":
         return _xml_camera(path, content, size)
+    if (lines := content.count(b"\n")) > MOST_LINES:
+        raise InputError(f"has {lines:,} lines", where=path, expected=f"a list of at most {MOST_LINES:,} cameras")
     rows = parse_rows(content, path, CAMERA_FORMATS, "CAMERA_ID MODEL WIDTH HEIGHT and parameters")
     numbers = [float(word) for row in rows[:4] for word in row.words if NUMBER.fullmatch(word)]
     # A matrix of 3x3, 3x4 or 4x4, in one row or in several.

@@ -23,6 +23,8 @@ from bidnerf_core.errors import InputError
 
 QuaternionOrder = Literal["wxyz", "xyzw"]
 """Order of a quaternion's components: the scalar part w comes first or last."""
+FARTHEST_CAMERA = 1e12
+"""Largest coordinate of a camera; squares of larger coordinates lose all precision."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +249,7 @@ def pose_from_matrix(matrix: Float[Tensor, "..."], what: str, where: object = No
     """Convert a row-major homogeneous 4x4 matrix to T_world_camera.
 
     Raises ``InputError``, whose message begins with ``where`` (if given) and ``what``, unless the matrix is 4x4,
-    has the last row 0 0 0 1, and has an orthonormal rotation.
+    has the last row 0 0 0 1, has an orthonormal rotation, and is not too far away.
     """
     if matrix.shape != (4, 4):
         raise InputError(f"{what} has shape {tuple(matrix.shape)}", where=where, expected="a 4x4 matrix T_world_camera")
@@ -262,6 +264,10 @@ def pose_from_matrix(matrix: Float[Tensor, "..."], what: str, where: object = No
             f"{what} is not a rigid transform",
             where=where,
             expected="an orthonormal rotation of determinant 1",
+        )
+    if (farthest := float(pose.translation.abs().max())) > FARTHEST_CAMERA:
+        raise InputError(
+            f"{what} is {farthest:g} away from the origin", where=where, expected=f"at most {FARTHEST_CAMERA:g}"
         )
     return pose.normalized()
 

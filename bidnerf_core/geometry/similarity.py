@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.se3 import FARTHEST_CAMERA, SE3
 
 LengthUnit = Literal["metres", "units"]
 """Unit of length of poses: ``"units"`` if its size in metres is unknown, as after structure from motion."""
@@ -28,8 +28,6 @@ CovarianceConvention = Literal["bidnerf", "gtsam", "ros"]
 """
 RIGID_TO = 5e-3
 """Largest entry of R^T R - I that is attributed to rounding (matrices printed with three decimals reach 2e-3)."""
-FARTHEST_CAMERA = 1e12
-"""Largest coordinate of a camera; squares of larger coordinates lose all precision."""
 
 
 def symbol(unit: LengthUnit) -> str:

@@ -47,13 +47,14 @@ def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
     """Open a regular file for reading. ``expected`` briefly describes what the file should be ("an image file").
 
     Raises ``InputError`` if there is no such file, if reading is not permitted, for a Git LFS pointer, and for
-    folders, pipes and devices: reading from a pipe could block forever.
+    folders, pipes, devices and what the kernel shows below /proc: reading from a pipe or from /proc/kmsg could block forever.
     """
     if isinstance(path, PackedFile):
         return io.BytesIO(path.read())
     try:
-        mode = path.stat().st_mode
-        file = path.open("rb") if stat.S_ISREG(mode) else None
+        facts = path.stat()
+        is_shown_by_kernel = os.path.isdir("/proc") and facts.st_dev == os.stat("/proc").st_dev
+        file = path.open("rb") if stat.S_ISREG(facts.st_mode) and not is_shown_by_kernel else None
         # The beginning of a file that stands for another one in a repository cloned without Git LFS.
         pointer = b"version https://git-lfs.github.com/spec/"
         is_pointer = file is not None and file.peek(len(pointer)).startswith(pointer)
@@ -67,7 +68,9 @@ def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
         ) from error
     if file is None:
         kinds = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFCHR: "a device"}
-        raise InputError(f"is {kinds.get(stat.S_IFMT(mode), 'no regular file')}", where=path, expected=expected)
+        raise InputError(
+            f"is {kinds.get(stat.S_IFMT(facts.st_mode), 'no regular file')}", where=path, expected=expected
+        )
     if is_pointer:
         file.close()
         raise InputError("is a pointer of Git LFS, not the file", where=path, expected="git lfs pull")

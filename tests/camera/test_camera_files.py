@@ -287,6 +287,12 @@ def test_files_of_other_programs_that_hold_no_camera(content: str, found: str, t
         read_camera(tmp_path / "c", SIZE)
 
 
+def test_a_list_of_more_cameras_than_any_capture_has_is_refused_before_it_is_parsed(tmp_path: Path) -> None:
+    (tmp_path / "list.txt").write_text("a.jpg PINHOLE 64 48 50 50 32 24\n" * 100_001)
+    with refused(where=tmp_path / "list.txt", found="100,001 lines", expected="at most 100,000 cameras"):
+        read_camera(tmp_path / "list.txt", SIZE, "a.jpg")
+
+
 def test_the_camera_of_a_photo_is_chosen_by_its_name(tmp_path: Path) -> None:
     (tmp_path / "list.txt").write_text(HLOC.format(camera=IDEAL))
     (tmp_path / "splats.json").write_text(splats(IDEAL, replace(IDEAL, fx=600.0, fy=610.0)))

@@ -203,6 +203,7 @@ NO_FILES: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "a pipe": ("x", os.mkfifo, "is a named pipe"),
     "a folder": ("x", Path.mkdir, "is a folder"),
     "a device": ("x", lambda path: path.symlink_to("/dev/zero"), "is a device"),
+    "the kernel's": ("x", lambda path: path.symlink_to("/proc/self/status"), "is no regular file"),
     "nothing": ("x", lambda path: None, "no such file"),
     "a zero byte": ("a\0b", lambda path: None, "cannot be opened"),
     "a long name": ("a" * 300, lambda path: None, "cannot be opened"),

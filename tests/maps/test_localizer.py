@@ -142,6 +142,7 @@ FOLDER, TAKES = "a Map, or the folder of one", "method 'bid' takes a BidConfig o
         (FRAME, 2 * np.eye(4), "start has the last row [0.0, 0.0, 0.0, 2.0]", ROW),
         (FRAME, np.diag([2.0, 2.0, 2.0, 1.0]), "start is not a rigid transform", RIGID),
         (FRAME, MIRRORED, "start is not a rigid transform", RIGID),
+        (FRAME, np.eye(4) + 1e308 * np.eye(4, k=3), "start is 1e+308 away from the origin", "at most 1e+12"),
         (FRAME, START.matrix() * torch.nan, "start has the last row [nan, nan, nan, nan]", ROW),
         (FRAME, [[1.0, 2.0], [3.0]], "start is a list", POSE),
         (FRAME, "pose.json", "start is a str", POSE),
