@@ -130,7 +130,7 @@ MethodName: TypeAlias = Annotated[
 DaskAddress: TypeAlias = Annotated[
     str | None,
     EXPERT,
-    Option("ADDRESS", "address of a dask scheduler whose workers detect keypoints and match those of posed images"),
+    Option("ADDRESS", "address of a dask scheduler whose workers detect and match keypoints"),
 ]
 Overwrite: TypeAlias = Annotated[bool, FLAG, Option(None, "replace output that exists")]
 

@@ -290,9 +290,8 @@ def executor_of(workers: Workers, trials: int, on_cpu: bool) -> Iterator[tuple[E
 
 @contextmanager
 def cluster(workers: Workers) -> Iterator[None]:
-    """Let ``train`` detect and match keypoints in other processes within the block, and ``find_poses`` detect them.
+    """Let ``train`` and ``find_poses`` detect and match keypoints in other processes within the block; the results are the same.
 
-    The results are the same. COLMAP matches photos without poses in this process.
     ``workers`` is a number of local processes (None: one per core), or the address of a dask scheduler, which repeats the tasks of a
     worker that is lost. Raises ``InputError`` as ``evaluate`` does.
     """

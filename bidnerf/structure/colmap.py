@@ -1,4 +1,4 @@
-"""COLMAP's database of photos: their cameras, keypoints, and the pairs of photos that match.
+"""COLMAP's database of photos: their cameras and keypoints.
 
 Photos of the same size whose EXIF states the same lens share a camera. The initial focal length is that of
 EXIF or a typical one, and is refined together with the poses. A camera given by the user is kept fixed.
@@ -9,14 +9,10 @@ from __future__ import annotations
 import contextlib
 import signal
 import threading
-from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeAlias
-
-import numpy as np
-import torch
+from typing import Any
 
 from bidnerf_core.camera import (
     UPRIGHT,
@@ -34,8 +30,8 @@ from bidnerf_core.datasets import Capture, Shot
 from bidnerf_core.devices import map_tasks
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.installation import import_extra
-from bidnerf_core.io import read_header, read_image
-from bidnerf_core.mapping import Keypoints, Sift, Vocabulary
+from bidnerf_core.io import read_compact_image, read_header
+from bidnerf_core.mapping import Keypoints, Sift
 from bidnerf_core.progress import counter
 
 MATCHED_SIDE = 1600
@@ -43,11 +39,6 @@ MATCHED_SIDE = 1600
 DETECTOR = Sift(count=4096, largest=MATCHED_SIDE)
 LEAST_PHOTOS = 3
 """Smallest number of photos in a model: two photos have a single baseline, which allows no check."""
-NEIGHBOURS = 10
-"""Number of photos before and after each photo, in order of name or time, with which it is matched."""
-
-Pairs: TypeAlias = list[tuple[int, int]]
-"""Pairs (i, j) of photos with i < j."""
 
 
 def import_pycolmap(what: str) -> Any:
@@ -195,12 +186,13 @@ def write_keypoints(database: Any, photos: PhotoSet, pycolmap: Any) -> None:
 
 
 def _keypoints(photo: ListedPhoto) -> Keypoints | InputError:
-    """Return the keypoints of the downscaled photo, without those on its transparent background, or the error."""
+    """Return the keypoints of the downscaled photo, the largest first, without those on its transparent background; or the error."""
     try:
-        rgb, alpha = read_image(photo.file, size=photo.reduced)
+        rgb, alpha = read_compact_image(photo.file, size=photo.reduced)
     except InputError as error:
         return error
     keypoints = DETECTOR(rgb)
+    keypoints = keypoints[keypoints.sizes.argsort(descending=True, stable=True)]
     if alpha is None:
         return keypoints
     columns, rows = keypoints.pixels.long().unbind(-1)
@@ -211,48 +203,3 @@ def _keypoints(photo: ListedPhoto) -> Keypoints | InputError:
 def _without_file(error: InputError, file: Path) -> str:
     """Return an error's message without the leading file path, which is shown next to the message anyway."""
     return str(error).removeprefix(f"{file}: ")
-
-
-def similar_pairs(descriptors: Sequence[np.ndarray]) -> Pairs:
-    """Return the pairs of photos to match: neighbours, and each photo with its 20 most similar ones by descriptors (n, 128).
-
-    Neighbours are likely to overlap, since photos and frames are taken one after another. Similar photos close loops, and connect
-    photos that are in arbitrary order. The similarity of two photos is the scalar product of their vectors of locally aggregated
-    descriptors (VLAD, Jégou et al. 2010), whose words are found in the photos themselves.
-    """
-    count, tensors = len(descriptors), [torch.from_numpy(own) for own in descriptors]
-    pairs = {(i, j) for i in range(count) for j in range(i + 1, min(count, i + NEIGHBOURS + 1))}
-    vocabulary = Vocabulary.of(tensors)
-    vectors = torch.stack([vocabulary.pool(own) for own in tensors])
-    for i, vector in enumerate(vectors):
-        similarity = vectors @ vector
-        similarity[i] = -torch.inf
-        pairs |= {(min(i, j), max(i, j)) for j in similarity.topk(min(20, count - 1)).indices.tolist()}
-    return sorted(pairs)
-
-
-def match(database: Path, pairs: Pairs, threads: int, pycolmap: Any) -> None:
-    """Match the ``pairs`` of photos (by number) that the database lacks, and verify the matches by two-view geometry.
-
-    If the job is cancelled, the matches found so far stay in the database. A batch of pairs cannot be
-    interrupted.
-    """
-    count = counter("matching photos", "pairs")
-    with pycolmap.Database.open(database) as stored:
-        todo = [pair for pair in pairs if not stored.exists_two_view_geometry(*pair)]
-    matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = 0
-    listed, size = database.with_name("pairs.txt"), 16
-    count(len(pairs) - len(todo), len(pairs))
-    for start in range(0, len(todo), size):
-        batch = todo[start : start + size]
-        listed.write_text("".join(f"{stored_name(i)} {stored_name(j)}\n" for i, j in batch))
-        pycolmap.match_image_pairs(
-            database,
-            matching,
-            pycolmap.ImportedPairingOptions(match_list_path=listed),
-            verification,
-            device=pycolmap.Device.cpu,
-        )
-        count(len(pairs) - len(todo) + start + len(batch), len(pairs))

@@ -12,16 +12,17 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from bidnerf.structure.colmap import (
     import_pycolmap,
     list_photos,
-    match,
-    similar_pairs,
     write_cameras,
     write_keypoints,
 )
+from bidnerf.structure.gps import align_to_gps, project_positions
+from bidnerf.structure.matching import candidate_pairs, chosen_pairs, match
 from bidnerf.structure.model import (
     count_contradictions,
     reasons_left_out,
@@ -79,7 +80,8 @@ def find_poses(
 
     The dataset is a ``transforms.json`` that refers to the photos in place; ``poses.json`` is the returned record,
     with the photos that were left out and why; ``sparse/0`` is the model in COLMAP's format. The unit of length is
-    metres if a recording without poses has depth, otherwise arbitrary, and z points up. Interrupted work in the same folder is resumed; poses already found for the same
+    metres if a recording without poses has depth, or if the EXIF of enough photos has GPS positions, which then also place the world
+    (see the record's ``geo_frame``); otherwise it is arbitrary. z points up. Interrupted work in the same folder is resumed; poses already found for the same
     photos are returned immediately, unless ``overwrite`` is set and ``reuse`` is not.
 
     ``progress`` receives each step; once ``cancel`` returns True, ``Cancelled`` is raised. Raises
@@ -156,12 +158,11 @@ def _search(
         photos.require_enough(source)
         keypoints = {photo.number: opened.num_keypoints_for_image(photo.number) for photo in photos.photos}
         numbers = [number for number, count in keypoints.items() if count]
-        pairs = list(itertools.combinations(numbers, 2))
-        # For more photos than this, matching all pairs would take hours.
-        if len(numbers) > (60 if video else 150):
-            similar = similar_pairs([opened.read_descriptors(number).data for number in numbers])
-            pairs = [(numbers[i], numbers[j]) for i, j in similar]
-    match(database, pairs, threads, pycolmap)
+        descriptors = [opened.read_descriptors(number).data for number in numbers]
+        positions, _ = project_positions({photo.number: photo for photo in photos.photos}, pycolmap)
+        known = np.array([positions.get(number, np.full(3, np.nan)) for number in numbers])
+        chosen = chosen_pairs(descriptors, candidate_pairs(descriptors, known))
+        match(opened, photos, [(numbers[i], numbers[j]) for i, j in chosen], pycolmap)
     models = reconstruct(database, work / "models", photos, threads, pycolmap)
     with pycolmap.Database.open(database) as opened:
         matched = zip(*opened.read_two_view_geometries(), strict=True)
@@ -180,10 +181,12 @@ def _search(
         sure, contradicting = count_contradictions(model, opened, pycolmap)
     error = model.compute_mean_reprojection_error()
     metric = scale_to_depth(model, by_number, pycolmap)
-    turn_upright(model, by_number, pycolmap)
+    geo_frame = None if metric else align_to_gps(model, by_number, pycolmap)
+    if geo_frame is None:
+        turn_upright(model, by_number, pycolmap)
     restore_size(model, by_number)
     base: Path = folder / FRAMES if video else source
-    write_dataset(folder, by_number, model, base, "metres" if metric else "units", images.depth_unit)
+    write_dataset(folder, by_number, model, base, "metres" if metric or geo_frame else "units", images.depth_unit)
     reasons = reasons_left_out(photos, models, Counter(itertools.chain(*overlapping)), keypoints)
     left_out = [
         LeftOut(shot.name, relative_path(Path(str(shot.image)), folder), reasons[shot.name])
@@ -205,5 +208,6 @@ def _search(
         sure_pairs=sure,
         contradicting=contradicting,
         turned=sum(by_number[number].exif.orientation != UPRIGHT for number in model.reg_image_ids()),
-        metric=metric,
+        metric=metric or geo_frame is not None,
+        geo_frame=geo_frame,
     )

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from bidnerf.structure.colmap import DETECTOR
+from bidnerf.structure.gps import GeoFrame
 from bidnerf_core.camera import Camera, CameraSource, Intrinsics
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.io import from_plain, read_json, write_file
@@ -50,8 +51,9 @@ class FoundPoses:
     video: bool = False  # whether the photos are frames of a video, which were written next to this record
     sure_pairs: int = 0  # pairs of registered photos with too many matches to show different places
     contradicting: int = 0  # of these, pairs whose matches contradict the poses
-    metric: bool = False  # whether the unit is metres, by measured depth
+    metric: bool = False  # whether the unit is metres, by measured depth or GPS
     turned: int = 0  # registered photos with an EXIF orientation; their cameras are those of the images as stored
+    geo_frame: GeoFrame | None = None  # where the world lies, by GPS
 
     @property
     def doubt(self) -> str | None:
@@ -73,7 +75,11 @@ class FoundPoses:
         several, more = len(self.models) > 1, len(self.left_out) - 5
         lines = (
             f"poses of {self.placed} of {amount(self.photos, 'photo')}; {amount(self.points, 'point')}, mean error"
-            f" {self.reprojection_error:.2f} px{'; in metres, by the measured depth' if self.metric else ''}",
+            f" {self.reprojection_error:.2f} px{'; in metres, by the measured depth' if self.metric and not self.geo_frame else ''}",
+            f"in metres, by the GPS of {amount(self.geo_frame.photos, 'photo')} (median distance {self.geo_frame.deviation:.1f} m): coordinates are"
+            f" those of {self.geo_frame.crs} minus {', '.join(f'{part:.0f}' for part in self.geo_frame.origin)}"
+            if self.geo_frame
+            else "",
             f"the photos fall into {len(self.models)} unconnected models of {', '.join(map(str, self.models))} photos;"
             " the largest is kept"
             if several

@@ -26,7 +26,9 @@ import bidnerf as bn
 import tiny
 from bidnerf.results import pose_error
 from bidnerf.structure import FoundPoses
-from bidnerf.structure.colmap import NEIGHBOURS, list_photos, similar_pairs, to_colmap
+from bidnerf.structure.colmap import list_photos, to_colmap
+from bidnerf.structure.gps import align_to_gps
+from bidnerf.structure.matching import NEIGHBOURS, PARTNERS, candidate_pairs, chosen_pairs
 from bidnerf.structure.model import count_contradictions, from_colmap
 from bidnerf.structure.record import digest, open_work, remove_output
 from bidnerf.structure.sources import (
@@ -224,7 +226,7 @@ def test_keypoints_are_detected_where_the_job_says(search: Search, tmp_path: Pat
 
     class Elsewhere(ThreadPoolExecutor):
         def submit(self, task: Callable[..., Any], /, *given: Any, **more: Any) -> Future[Any]:
-            tasks.append(Path(given[0].file).name)
+            tasks.append(Path(given[0].file).name if hasattr(given[0], "file") else task.__name__)
             return super().submit(task, *given, **more)
 
     with Elsewhere(1) as executor, job_context(executor=executor), pytest.raises(bn.Cancelled):
@@ -387,21 +389,72 @@ def test_a_camera_that_only_turns_is_refused_though_its_focal_length_is_unknown(
         bn.find_poses(tmp_path / "photos", tmp_path / "poses")
 
 
-def test_many_photos_are_matched_with_neighbours_and_those_that_look_alike() -> None:
+def test_many_photos_are_matched_with_those_whose_keypoints_vote_for_each_other() -> None:
     generator = np.random.default_rng(0)
-    count = 60
-    places = [generator.integers(0, 256, (40, 128)) for _ in range(count // 2)]  # each is visited twice
+    count = 150
+    visits = [generator.integers(0, 256, (40, 128)) for _ in range(count // 2)]  # each is visited twice
     seen = [
-        np.clip(places[n % (count // 2)] + generator.integers(-9, 10, (40, 128)), 0, 255).astype(np.uint8)
+        np.clip(visits[n % (count // 2)] + generator.integers(-9, 10, (40, 128)), 0, 255).astype(np.uint8)
         for n in range(count)
     ]
-    pairs = similar_pairs(seen)
+    pairs = candidate_pairs(seen)
     assert pairs == sorted(set(pairs))
     assert all(0 <= i < j < count for i, j in pairs)
     assert {(i, i + d) for i in range(count - NEIGHBOURS) for d in range(1, NEIGHBOURS + 1)} <= set(pairs)
     again = [(i, i + count // 2) for i in range(count // 2)]
-    assert sum(pair in pairs for pair in again) == len(again)
-    assert len(pairs) < count * (count - 1) / 2
+    assert set(again) <= set(pairs)
+    assert len(pairs) < 0.9 * count * (count - 1) / 2
+    assert chosen_pairs(seen, pairs) == again
+    # Of many that vote, the best are matched; and all pairs of few photos.
+    alike = [seen[0]] * 20 + seen[1:61]
+    partners = [pair for pair in chosen_pairs(alike, candidate_pairs(alike)) if 0 in pair]
+    assert PARTNERS <= len(partners) < 20
+    assert len(chosen_pairs(seen[:9], candidate_pairs(seen[:9]))) == 36
+
+
+def test_photos_that_are_near_by_gps_are_candidates() -> None:
+    generator = np.random.default_rng(0)
+    seen = [generator.integers(0, 256, (40, 128)).astype(np.uint8) for _ in range(400)]
+    positions = np.full((400, 3), np.nan)
+    positions[[0, 200, 399]] = [[0, 0, 0], [1, 0, 0], [0, 2, 0]]
+    assert not {(0, 200), (0, 399), (200, 399)} <= set(candidate_pairs(seen))
+    assert {(0, 200), (0, 399), (200, 399)} <= set(candidate_pairs(seen, positions))
+
+
+@pytest.mark.parametrize(("latitude", "crs"), [(48.1, "EPSG:32632"), (-33.9, "EPSG:32732")])
+def test_gps_places_a_model_that_it_does_not_bend(tmp_path: Path, latitude: float, crs: str) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    generator = np.random.default_rng(0)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=12, num_points3D=20
+    )
+    model = pycolmap.synthesize_dataset(options)
+    numbers = sorted(model.reg_image_ids())
+    true = np.array([[40.0 * (n % 4), 30.0 * (n // 4), 5.0 * (n % 3)] for n in range(12)])
+    for number, centre in zip(numbers, true, strict=True):
+        pose = model.image(number).cam_from_world()
+        frame = model.frame(model.image(number).frame_id)
+        frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, -(pose.rotation.matrix() @ (centre / 7)))
+
+    def photos(metres: np.ndarray) -> dict[int, Any]:
+        local = pycolmap.GPSTransform().enu_to_ellipsoid(metres, latitude, 9.0, 300.0)
+        for number, position in zip(numbers, local.tolist(), strict=True):
+            write_photo(tmp_path / f"{number}.jpg", np.zeros((8, 8, 3), np.uint8), gps=tuple(position))
+        return {number: SimpleNamespace(file=tmp_path / f"{number}.jpg") for number in numbers}
+
+    before = [model.image(number).projection_center() for number in numbers]
+    straight = np.column_stack([true[:, 0], np.zeros((12, 2))])
+    assert align_to_gps(model, photos(straight), pycolmap) is None
+    assert np.array_equal(before, [model.image(number).projection_center() for number in numbers])
+    wrong = true + generator.normal(0, 1, true.shape)
+    wrong[5] += 500
+    frame = require(align_to_gps(model, photos(wrong), pycolmap))
+    assert (frame.crs, frame.photos) == (crs, 12)
+    assert 0.3 < frame.deviation < 3
+    centres = np.array([model.image(number).projection_center() for number in numbers])
+    scale, parts = np.linalg.norm(centres[11] - centres[0]), np.linalg.norm(centres - centres[0], axis=1)
+    assert scale == pytest.approx(np.linalg.norm(true[11] - true[0]), rel=0.03)
+    assert np.allclose(parts / scale, np.linalg.norm(true - true[0], axis=1) / np.linalg.norm(true[11] - true[0]))
 
 
 def test_frames_are_chosen_at_equal_steps_of_motion_the_sharpest_near_each() -> None:

@@ -1,0 +1,166 @@
+"""Which photos are matched, and their matches: candidates from what is known, votes of large keypoints, two-view geometry.
+
+Candidates are photos that follow each other, that look alike, and that were taken nearby according to GPS. The largest keypoints of two
+candidates vote for them; photos are matched with the candidates with the most votes, and two-view geometry verifies the matches. Votes
+and matches are tasks of the job's executor, such as a cluster.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from itertools import combinations, groupby
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from jaxtyping import Int, UInt8
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from bidnerf.structure.colmap import PhotoSet, import_pycolmap
+from bidnerf_core.devices import map_tasks
+from bidnerf_core.mapping import Vocabulary, squared_distances
+from bidnerf_core.mapping.landmarks.descriptors import NORM
+from bidnerf_core.progress import counter
+
+EXHAUSTIVE = 60
+"""Number of photos up to which all pairs are matched."""
+NEIGHBOURS = 10
+"""Number of photos before and after each photo, in order of name or time, that are its candidates."""
+SIMILAR, NEARBY = 60, 20
+"""Number of photos with the most similar descriptors, and of the nearest photos by GPS, that are a photo's candidates."""
+VOTERS = 500
+"""Number of a photo's largest keypoints that vote for its candidates. They stay visible when the distance changes."""
+PARTNERS = 12
+"""Number of candidates with the most votes with which a photo is matched; with those that choose it, there are about 18."""
+RATIO = 0.8
+"""Largest ratio of the distances to the nearest and the second-nearest keypoint of a match (Lowe 2004)."""
+FARTHEST = 2 * (1 - math.cos(0.7)) * NORM**2
+"""Largest squared distance of a match: descriptors 0.7 radians apart, as in COLMAP."""
+BLOCK = 256
+"""Number of keypoints whose distances to all of another photo are computed at a time, which fit the processor's cache."""
+
+Pairs: TypeAlias = list[tuple[int, int]]
+"""Pairs (i, j) of photos with i < j."""
+
+
+@dataclass(frozen=True, eq=False)
+class StoredKeypoints:
+    """What a database holds of a photo: its camera (of pycolmap), and its keypoints, the largest first."""
+
+    camera: Any
+    pixels: np.ndarray  # (n, 2)
+    descriptors: np.ndarray  # (n, 128), bytes
+
+
+def candidate_pairs(descriptors: Sequence[np.ndarray], positions: np.ndarray | None = None) -> Pairs:
+    """Return the pairs of photos that may overlap: all of few photos, else neighbours in order, similar photos, and near ones.
+
+    The similarity of two photos is the scalar product of their vectors of locally aggregated descriptors (VLAD, Jégou et al. 2010) of
+    ``descriptors`` (n, 128), whose words are found in the photos themselves. ``positions`` (n, 3) are in metres, NaN if unknown.
+    """
+    count = len(descriptors)
+    if count <= EXHAUSTIVE:
+        return list(combinations(range(count), 2))
+    pairs = {(i, j) for i in range(count) for j in range(i + 1, min(count, i + NEIGHBOURS + 1))}
+    tensors = [torch.from_numpy(own.copy()) for own in descriptors]
+    vocabulary = Vocabulary.of(tensors)
+    vectors = torch.stack([vocabulary.pool(own) for own in tensors])
+    alike = [(vectors @ vector).topk(min(SIMILAR + 1, count)).indices.tolist() for vector in vectors]
+    partners = dict(enumerate(alike))
+    known = np.zeros(0, int) if positions is None else np.flatnonzero(np.isfinite(positions).all(1))
+    if positions is not None and len(known) > 1:
+        near = cKDTree(positions[known]).query(positions[known], min(NEARBY + 1, len(known)))[1]
+        for i, others in zip(known.tolist(), known[near].tolist(), strict=True):
+            partners[i] = partners[i] + others
+    pairs |= {(min(i, j), max(i, j)) for i, others in partners.items() for j in others if i != j}
+    return sorted(pairs)
+
+
+def chosen_pairs(descriptors: Sequence[np.ndarray], candidates: Pairs) -> Pairs:
+    """Return the pairs of photos to match: of few photos all, else each photo's ``candidates`` with the most votes.
+
+    The votes are the mutual nearest neighbours among the largest keypoints that pass the ratio test.
+    """
+    if len(descriptors) <= EXHAUSTIVE:
+        return candidates
+    count = counter("comparing photos", "photos")
+    largest, votes = [own[:VOTERS] for own in descriptors], np.zeros((len(descriptors), len(descriptors)), np.int32)
+    grouped = [(i, [j for _, j in pairs]) for i, pairs in groupby(candidates, lambda pair: pair[0])]
+    tasks: Any = map_tasks(_votes, ((largest[i], [largest[j] for j in others]) for i, others in grouped))
+    with closing(tasks) as results:
+        for done, ((i, others), result) in enumerate(zip(grouped, results, strict=True), start=1):
+            votes[i, others] = votes[others, i] = result
+            count(done, len(grouped))
+    best = np.argsort(-votes, axis=1, kind="stable")[:, :PARTNERS]
+    wanted = {(min(i, j), max(i, j)) for i, row in enumerate(best.tolist()) for j in row if votes[i, j]}
+    return sorted(wanted & set(candidates))
+
+
+def _votes(own: np.ndarray, others: Sequence[np.ndarray]) -> list[int]:
+    """Return the number of keypoints of a photo that each of the ``others`` shows as well, judging by descriptors (n, 128)."""
+    return [len(mutual_matches(torch.tensor(own), torch.tensor(other))) for other in others]
+
+
+def mutual_matches(a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"]) -> Int[Tensor, "p 2"]:
+    """Return the pairs of descriptors that are each other's nearest, and far nearer than the second-nearest of both."""
+    if min(len(a), len(b)) < 2:
+        return torch.zeros((0, 2), dtype=torch.long)
+    nearest, partner, second = torch.empty(len(a)), torch.empty(len(a), dtype=torch.long), torch.empty(len(a))
+    least, others = torch.full((len(b),), torch.inf), b.float()
+    for rows in torch.arange(len(a)).split(BLOCK):
+        distances = squared_distances(a[rows], others)
+        least = least.minimum(distances.amin(0))
+        nearest[rows], partner[rows] = distances.min(1)
+        second[rows] = distances.scatter_(1, partner[rows, None], torch.inf).amin(1)
+    is_match = (nearest == least[partner]) & (nearest < RATIO**2 * second) & (nearest < FARTHEST)
+    numbers = is_match.nonzero()[:, 0]
+    returned = squared_distances(others[partner[numbers]], a)
+    returned.scatter_(1, numbers[:, None], torch.inf)
+    numbers = numbers[nearest[numbers] < RATIO**2 * returned.amin(1)]
+    # Of equal descriptors, the first one
+    first = torch.full((len(b),), len(a)).scatter_reduce(0, partner[numbers], numbers, "amin")
+    numbers = numbers[first[partner[numbers]] == numbers]
+    return torch.stack([numbers, partner[numbers]], dim=-1)
+
+
+def match(database: Any, photos: PhotoSet, pairs: Pairs, pycolmap: Any) -> None:
+    """Match the ``pairs`` of photos (by number) that the database lacks, and verify the matches by two-view geometry.
+
+    If the job is cancelled, the matches found so far stay in the database.
+    """
+    count = counter("matching photos", "pairs")
+    todo = [pair for pair in pairs if not database.exists_two_view_geometry(*pair)]
+    done = len(pairs) - len(todo)
+    count(done, len(pairs))
+    cameras = {photo.number: database.read_camera(photo.camera) for photo in photos.photos}
+
+    def stored(number: int) -> StoredKeypoints:
+        pixels = database.read_keypoints(number)[:, :2].astype(np.float64)
+        return StoredKeypoints(cameras[number], pixels, database.read_descriptors(number).data)
+
+    grouped = [(i, [j for _, j in part]) for i, part in groupby(todo, lambda pair: pair[0])]
+    tasks: Any = map_tasks(_geometries, ((stored(i), [stored(j) for j in others]) for i, others in grouped))
+    with closing(tasks) as results:
+        for (i, others), result in zip(grouped, results, strict=True):
+            with pycolmap.DatabaseTransaction(database):
+                for j, geometry in zip(others, result, strict=True):
+                    database.write_two_view_geometry(i, j, geometry)
+            done += len(others)
+            count(done, len(pairs))
+
+
+def _geometries(own: StoredKeypoints, others: Sequence[StoredKeypoints]) -> list[Any]:
+    """Match a photo with others; return pycolmap's two-view geometries, whose matches are those that fit them."""
+    pycolmap = import_pycolmap("matching photos")
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0
+    descriptors, geometries = torch.tensor(own.descriptors), []
+    for other in others:
+        matches = mutual_matches(descriptors, torch.tensor(other.descriptors)).numpy()
+        ends = own.camera, own.pixels, other.camera, other.pixels
+        geometries.append(pycolmap.estimate_two_view_geometry(*ends, matches.astype(np.uint32), verification))
+    return geometries
