@@ -33,9 +33,16 @@ import torch
 from _lab import Row, RowStore, one_thread, parser, record
 
 import bidnerf as bn
-from bidnerf.structure import FoundPoses, photos_of
-from bidnerf.structure.colmap import LEAST_PHOTOS, import_pycolmap, list_photos, write_cameras, write_keypoints
-from bidnerf.structure.record import MODEL
+from bidnerf.structure import (
+    LEAST_PHOTOS,
+    MODEL,
+    FoundPoses,
+    import_pycolmap,
+    list_photos,
+    photos_of,
+    write_cameras,
+    write_keypoints,
+)
 from bidnerf_core.geometry import fit_similarity
 from bidnerf_core.progress import Progress, job_context
 

@@ -1,4 +1,10 @@
+from .colmap import LEAST_PHOTOS as LEAST_PHOTOS
+from .colmap import import_pycolmap as import_pycolmap
+from .colmap import list_photos as list_photos
+from .colmap import write_cameras as write_cameras
+from .colmap import write_keypoints as write_keypoints
 from .poses import find_poses as find_poses
+from .record import MODEL as MODEL
 from .record import FoundPoses as FoundPoses
 from .sources import photos_of as photos_of
 from .sources import refuse_panoramas as refuse_panoramas

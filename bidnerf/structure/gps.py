@@ -14,7 +14,7 @@ from PIL.ExifTags import GPS, IFD
 
 from bidnerf.structure.colmap import ListedPhoto
 
-OUTLIER = 10.0
+GPS_OUTLIER = 10.0
 """Largest distance (metres) between a position by GPS and that of the camera in the model. Most receivers are within five metres."""
 LEAST_POSITIONS = 8
 """Smallest number of positions that agree with a model, and by which it is aligned."""
@@ -73,14 +73,14 @@ def align_to_gps(model: Any, photos: Mapping[int, ListedPhoto], pycolmap: Any) -
         return None
     origin = np.floor(np.median([*positions.values()], axis=0))
     given = np.array([*positions.values()]) - origin
-    options = pycolmap.RANSACOptions(max_error=OUTLIER, random_seed=0)
+    options = pycolmap.RANSACOptions(max_error=GPS_OUTLIER, random_seed=0)
     names = [model.image(number).name for number in positions]
     similarity = pycolmap.align_reconstruction_to_locations(model, names, given, LEAST_POSITIONS, options)
     if similarity is None:
         return None
     centres = np.array([model.image(number).projection_center() for number in positions])
     away = np.linalg.norm(np.array([similarity * centre for centre in centres]) - given, axis=1)
-    extent = np.linalg.svd(given[away < OUTLIER] - given[away < OUTLIER].mean(0), compute_uv=False)[1]
+    extent = np.linalg.svd(given[away < GPS_OUTLIER] - given[away < GPS_OUTLIER].mean(0), compute_uv=False)[1]
     if extent / math.sqrt(len(given)) < SPREAD * np.median(away):  # a straight path leaves a rotation open
         return None
     model.transform(similarity)

@@ -23,24 +23,23 @@ from torch import Tensor
 from bidnerf.structure.colmap import PhotoSet, import_pycolmap
 from bidnerf_core.devices import map_tasks
 from bidnerf_core.mapping import Vocabulary, squared_distances
-from bidnerf_core.mapping.landmarks.descriptors import NORM
 from bidnerf_core.progress import counter
 
 EXHAUSTIVE = 60
 """Number of photos up to which all pairs are matched."""
 NEIGHBOURS = 10
 """Number of photos before and after each photo, in order of name or time, that are its candidates."""
-SIMILAR, NEARBY = 60, 20
+SIMILAR_PHOTOS, NEAR_PHOTOS = 60, 20
 """Number of photos with the most similar descriptors, and of the nearest photos by GPS, that are a photo's candidates."""
-VOTERS = 500
+VOTING_KEYPOINTS = 500
 """Number of a photo's largest keypoints that vote for its candidates. They stay visible when the distance changes."""
 PARTNERS = 12
 """Number of candidates with the most votes with which a photo is matched; with those that choose it, there are about 18."""
 RATIO = 0.8
 """Largest ratio of the distances to the nearest and the second-nearest keypoint of a match (Lowe 2004)."""
-FARTHEST = 2 * (1 - math.cos(0.7)) * NORM**2
-"""Largest squared distance of a match: descriptors 0.7 radians apart, as in COLMAP."""
-BLOCK = 256
+FARTHEST_MATCH = 2 * (1 - math.cos(0.7)) * 512**2
+"""Largest squared distance of a match: descriptors 0.7 radians apart, as in COLMAP; their norm is 512."""
+MATCHED_ROWS = 256
 """Number of keypoints whose distances to all of another photo are computed at a time, which fit the processor's cache."""
 
 Pairs: TypeAlias = list[tuple[int, int]]
@@ -69,11 +68,11 @@ def candidate_pairs(descriptors: Sequence[np.ndarray], positions: np.ndarray | N
     tensors = [torch.from_numpy(own.copy()) for own in descriptors]
     vocabulary = Vocabulary.of(tensors)
     vectors = torch.stack([vocabulary.pool(own) for own in tensors])
-    alike = [(vectors @ vector).topk(min(SIMILAR + 1, count)).indices.tolist() for vector in vectors]
+    alike = [(vectors @ vector).topk(min(SIMILAR_PHOTOS + 1, count)).indices.tolist() for vector in vectors]
     partners = dict(enumerate(alike))
     known = np.zeros(0, int) if positions is None else np.flatnonzero(np.isfinite(positions).all(1))
     if positions is not None and len(known) > 1:
-        near = cKDTree(positions[known]).query(positions[known], min(NEARBY + 1, len(known)))[1]
+        near = cKDTree(positions[known]).query(positions[known], min(NEAR_PHOTOS + 1, len(known)))[1]
         for i, others in zip(known.tolist(), known[near].tolist(), strict=True):
             partners[i] = partners[i] + others
     pairs |= {(min(i, j), max(i, j)) for i, others in partners.items() for j in others if i != j}
@@ -88,7 +87,10 @@ def chosen_pairs(descriptors: Sequence[np.ndarray], candidates: Pairs) -> Pairs:
     if len(descriptors) <= EXHAUSTIVE:
         return candidates
     count = counter("comparing photos", "photos")
-    largest, votes = [own[:VOTERS] for own in descriptors], np.zeros((len(descriptors), len(descriptors)), np.int32)
+    largest, votes = (
+        [own[:VOTING_KEYPOINTS] for own in descriptors],
+        np.zeros((len(descriptors), len(descriptors)), np.int32),
+    )
     grouped = [(i, [j for _, j in pairs]) for i, pairs in groupby(candidates, lambda pair: pair[0])]
     tasks: Any = map_tasks(_votes, ((largest[i], [largest[j] for j in others]) for i, others in grouped))
     with closing(tasks) as results:
@@ -111,12 +113,12 @@ def mutual_matches(a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"]) -> Int[Tens
         return torch.zeros((0, 2), dtype=torch.long)
     nearest, partner, second = torch.empty(len(a)), torch.empty(len(a), dtype=torch.long), torch.empty(len(a))
     least, others = torch.full((len(b),), torch.inf), b.float()
-    for rows in torch.arange(len(a)).split(BLOCK):
+    for rows in torch.arange(len(a)).split(MATCHED_ROWS):
         distances = squared_distances(a[rows], others)
         least = least.minimum(distances.amin(0))
         nearest[rows], partner[rows] = distances.min(1)
         second[rows] = distances.scatter_(1, partner[rows, None], torch.inf).amin(1)
-    is_match = (nearest == least[partner]) & (nearest < RATIO**2 * second) & (nearest < FARTHEST)
+    is_match = (nearest == least[partner]) & (nearest < RATIO**2 * second) & (nearest < FARTHEST_MATCH)
     numbers = is_match.nonzero()[:, 0]
     returned = squared_distances(others[partner[numbers]], a)
     returned.scatter_(1, numbers[:, None], torch.inf)

@@ -25,8 +25,7 @@ from bidnerf_core.captures.cameras import record_refinement
 from bidnerf_core.captures.training_views import adjust_poses, check_depth_unit, prepare_views, training_poses
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.mapping import ImageKeypoints, LandmarkConfig, Sift, TrackedViews, track_views
-from bidnerf_core.mapping.landmarks.tracks import PairMatches, epipolar_matches
+from bidnerf_core.mapping import LandmarkConfig, Sift, TrackedViews, track_views
 from inaccurate_captures import VIEWS, refined, turned, updates
 from landmark_scene import Points, looking_in, ring
 from optional import require
@@ -190,32 +189,3 @@ def test_a_scale_of_depth_that_is_a_few_percent_wrong_is_logged(
     caplog.set_level("INFO", "bidnerf")
     check_depth_unit(measured(ratio))
     assert ("times the depth that the poses and photos imply; training takes both" in caplog.text) == said
-
-
-def test_only_pairs_whose_relative_pose_has_changed_are_matched_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    points, config = Points(noise=0.4), LandmarkConfig()
-    tracked = track_views(ring(points), points)
-    seen, positions = tracked.triangulate(config)
-    matched = list[tuple[float, ...]]()
-
-    def match(a: ImageKeypoints, b: ImageKeypoints) -> PairMatches:
-        matched.append((float(a.T_ref_camera.translation[0]), float(b.T_ref_camera.translation[0])))
-        return epipolar_matches(a, b)
-
-    monkeypatch.setattr("bidnerf_core.mapping.landmarks.building.epipolar_matches", match)
-    # The world moves as a whole: no pair changes.
-    T = SE3.exp(torch.tensor([3.0, -1.0, 2.0, 0.5, 1.0, -0.3], dtype=torch.float64))
-    moved = tracked.at(T @ tracked.T_world_camera)
-    again = moved.rematch(config, *moved.triangulate(config))
-    assert not matched
-    assert torch.equal(again.observations.point, tracked.observations.point)
-    # One image turns by a pixel: its pairs are matched again, and give the tracks of a matching from scratch.
-    turn = torch.zeros(len(tracked.T_world_camera.translation), 6, dtype=torch.float64)
-    turn[WRONG, 4] = 1 / 300
-    moved = tracked.at(tracked.T_world_camera.retract(turn))
-    own = float(moved.T_world_camera.translation[WRONG, 0])
-    again = moved.rematch(config, seen, positions)
-    assert len(matched) > 3
-    assert all(own in pair for pair in matched)
-    scratch = replace(moved, matches={}).rematch(config, seen, positions)
-    assert torch.equal(again.observations.point, scratch.observations.point)

@@ -403,3 +403,32 @@ def test_each_landmark_is_in_one_cell_which_holds_it() -> None:
     cell = torch.arange(len(cells.counts)).repeat_interleave(cells.counts)
     apart = (positions[cells.order] - cells.centres[cell]).norm(dim=-1)
     assert bool((apart <= cells.radii[cell] + 1e-4).all())
+
+
+def test_only_pairs_whose_relative_pose_has_changed_are_matched_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    points, config = Points(noise=0.4), LandmarkConfig()
+    tracked = track_views(ring(points), points)
+    seen, positions = tracked.triangulate(config)
+    matched = list[tuple[float, ...]]()
+
+    def match(a: ImageKeypoints, b: ImageKeypoints) -> PairMatches:
+        matched.append((float(a.T_ref_camera.translation[0]), float(b.T_ref_camera.translation[0])))
+        return epipolar_matches(a, b)
+
+    monkeypatch.setattr("bidnerf_core.mapping.landmarks.building.epipolar_matches", match)
+    # The world moves as a whole: no pair changes.
+    T = SE3.exp(torch.tensor([3.0, -1.0, 2.0, 0.5, 1.0, -0.3], dtype=torch.float64))
+    moved = tracked.at(T @ tracked.T_world_camera)
+    again = moved.rematch(config, *moved.triangulate(config))
+    assert not matched
+    assert torch.equal(again.observations.point, tracked.observations.point)
+    # One image turns by a pixel: its pairs are matched again, and give the tracks of a matching from scratch.
+    turn = torch.zeros(len(tracked.T_world_camera.translation), 6, dtype=torch.float64)
+    turn[7, 4] = 1 / 300
+    moved = tracked.at(tracked.T_world_camera.retract(turn))
+    own = float(moved.T_world_camera.translation[7, 0])
+    again = moved.rematch(config, seen, positions)
+    assert len(matched) > 3
+    assert all(own in pair for pair in matched)
+    scratch = replace(moved, matches={}).rematch(config, seen, positions)
+    assert torch.equal(again.observations.point, scratch.observations.point)
