@@ -56,9 +56,9 @@ from bidnerf_core.settings import Above, Range, Settings
 
 LEAST_VISIBLE_POINTS = 20
 """Minimum number of points from which the pose of an image is estimated."""
-SETTLED_MATCHES = 0.25
+SETTLED = 0.25
 """Motion of points in an image (pixels) up to which the matches of a pair are kept when poses change: an eighth of the epipolar band."""
-SAMPLE_POINTS = 32
+SAMPLE = 32
 """Number of points from which that motion is estimated; images that see fewer than a quarter of it are matched again."""
 ENOUGH_IMAGES = 8
 """Minimum number of images from which the covariance of pose updates is estimated."""
@@ -298,10 +298,10 @@ def _link_keypoints(
 def _samples(seen: TrackedKeypoints, points: Float[Tensor, "n 3"]) -> Float[Tensor, "v s 3"]:
     """Return evenly spread ``points`` that each image sees, in its camera frame (metres), or NaN if it sees too few."""
     counts = torch.bincount(seen.image, minlength=len(seen.images))
-    rank = torch.arange(SAMPLE_POINTS) * counts[:, None] // SAMPLE_POINTS + (counts.cumsum(0) - counts)[:, None]
+    rank = torch.arange(SAMPLE) * counts[:, None] // SAMPLE + (counts.cumsum(0) - counts)[:, None]
     local = seen.sightings.in_camera(points)[seen.image.argsort(stable=True)]
     samples = torch.full((*rank.shape, 3), torch.nan, dtype=local.dtype)
-    enough = counts >= SAMPLE_POINTS / 4
+    enough = counts >= SAMPLE / 4
     samples[enough] = local[rank[enough]]
     return samples
 
@@ -322,7 +322,7 @@ def _settled(
     earlier = SE3(change.rotation[:, None], change.translation[:, None]).apply(local)
     away = torch.linalg.vector_norm(pinhole(earlier)[0] - pinhole(local)[0], dim=-1).median(1).values
     pixels = away * torch.tensor([images[j].focal for _, j in both], dtype=away.dtype)
-    return [pair for pair, moved in zip(both, pixels.tolist(), strict=True) if moved <= SETTLED_MATCHES]
+    return [pair for pair, moved in zip(both, pixels.tolist(), strict=True) if moved <= SETTLED]
 
 
 def detect_keypoints(views: Sequence[View], features: Features) -> list[ImageKeypoints]:
