@@ -19,7 +19,7 @@ EQUIVALENT_MM = 41  # on 35 mm film, about the focal length of ``tiny.CAMERA``
 
 
 def fill(folder: Path) -> None:
-    """Write DATA, SCAN, MAP, MAP2, MAPS/, photo.jpg, depth.png, photos/, camera.json, pose.json and poses.json into ``folder``."""
+    """Write DATA, SCAN, MAP, MAP2, MAPS/, PROJECT/, photos/, and files such as photo.jpg and camera.json into ``folder``."""
     seen = zip(tiny.views(3, seed=1), TEST_FRAMES, strict=True)
     test = [replace(view, frame=replace(view.frame, name=name)) for view, name in seen]
     write_transforms(folder / "DATA", {"train": tiny.views(8), "test": test}, tiny.BACKGROUND)
@@ -45,3 +45,8 @@ def fill(folder: Path) -> None:
     }
     for name, content in plain_files.items():
         (folder / name).write_text(json.dumps(content))
+    # What commands name that are only parsed.
+    for name in ("PROJECT", "new-photos"):
+        (folder / name).mkdir()
+    for name in ("splat.ply", "RESULTS.jsonl", "results.jsonl", "known.json", "track.json"):
+        (folder / name).touch()
