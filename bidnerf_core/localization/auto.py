@@ -103,9 +103,11 @@ def _on_surface(
             confidence=verdict.confidence,
             diagnostics=judged,
         )
-    # A landmark-based pose with too few matches is a pose by chance.
-    is_better = found.converged or best is None or best.outcome is Outcome.TOO_FEW_MATCHES
-    return found if is_better or best is None else best
+    # A landmark-based pose with too few matches is a pose by chance. Of five poses that only the surface supported, where landmarks had
+    # found an uncertain one, three were wrong (``answers_new``).
+    if best is None or best.outcome is Outcome.TOO_FEW_MATCHES:
+        return found
+    return found if found.converged and best.outcome is not Outcome.UNCERTAIN else best
 
 
 def localization_of(problem: Problem, answer: LandmarkAnswer, began: float) -> Localization:
