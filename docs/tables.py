@@ -664,17 +664,19 @@ def large_answers(records: Records) -> str:
 
 @table
 def large_projection(records: Records) -> str:
-    """What a million photos would take, by the growth that was measured."""
-    *_, (title, last) = _sizes(records, "photos")
-    more = 1e6 / last["photos"]
-    grown = records["large"]["exponents"]
-    hours = {step: last["steps"][step]["cpu_seconds"] * more ** grown[step] / 3600 for step in STEPS}
-    memory = last["most_memory_MB"] * more ** grown["memory"] / 1e3
-    rows = [(step, f"{value:.0f} h" if value >= 1 else f"{60 * value:.0f} min") for step, value in hours.items()]
-    rows += [
-        ("memory of one process", f"{memory:,.0f} GB"),
-        ("map on disk", f"{last['map_MB'] * more / 1e3:,.0f} GB"),
-    ]
+    """What a million photos would take, if each further one took as much as those between the two largest sizes."""
+    *_, (_, former), (title, last) = _sizes(records, "photos")
+
+    def projected(value: Callable[[Record], float]) -> float:
+        each = (value(last) - value(former)) / (last["photos"] - former["photos"])
+        return value(last) + each * (1_000_000 - last["photos"])
+
+    rows = []
+    for step in STEPS:
+        minutes = projected(lambda found, step=step: found["steps"][step]["cpu_seconds"]) / 60  # type: ignore[misc]
+        rows.append((step, f"{minutes / 60:.1f} h" if minutes >= 60 else f"{minutes:.0f} min"))
+    for what, name in (("memory of one process", "most_memory_MB"), ("map on disk", "map_MB")):
+        rows.append((what, f"{projected(lambda found, name=name: found[name]) / 1e3:,.0f} GB"))  # type: ignore[misc]
     return _table(("a million photos like these, in one map", f"projected from {title}, one core"), rows, records)
 
 
