@@ -14,6 +14,7 @@ Each measurement has a process of its own. SCENE is a name as ``answer_maps.py``
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import multiprocessing
@@ -49,11 +50,14 @@ from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
     SIFT,
     USUAL_FEATURES,
+    DescriptorCells,
+    InvertedFile,
     LandmarkMap,
     Tracks,
     concatenate,
     detect_keypoints,
     likely_pairs,
+    squared_distances,
     track_views,
 )
 from bidnerf_core.maps import MapInfo
@@ -102,7 +106,7 @@ def counts(rows: Sequence[Row]) -> Row:
 
 def distractors(scenes: Sequence[str]) -> torch.Tensor:
     """Return the descriptors of all keypoints in the images of some scenes, and of their mirror images; a file keeps the first."""
-    file = folder_of_keypoints(CACHE).with_name("-".join(["distractors", *scenes, "keypoints.pt"]))
+    file = CACHE / f"{folder_of_keypoints(CACHE).name.replace('building', '-'.join(scenes))}.pt"
     if not file.exists():
         parts = list[torch.Tensor]()
         for scene in scenes:
@@ -190,6 +194,44 @@ def ask_scene(folder: Path, scene: str, frames: int) -> Row:
     return counts(rows) | {"opened_cpu_seconds": opened} | sizes
 
 
+def search(others: Sequence[str], size: int, count: int = 500) -> Row:
+    """Search the nearest descriptors of ``count`` others among ``size`` ones, by the index of maps and, if it is installed, by faiss.
+
+    Both divide the descriptors, in bytes, into equally many cells, of which they search the twelve nearest.
+    """
+    one_thread()
+    many = distractors(others)
+    chosen = torch.randperm(len(many), generator=torch.Generator().manual_seed(0))[: size + count]
+    known, queries = many[chosen[:size]], many[chosen[size:]]
+    nearest = torch.cat([squared_distances(part, known).argmin(1) for part in queries.split(50)])
+    began = time.process_time()
+    cells = DescriptorCells.of(known)
+    order = cells.cell.argsort(stable=True)
+    index = InvertedFile(known[order], cells[order])
+    rows = {"ours": {"build_cpu_seconds": time.process_time() - began}}
+    began = time.process_time()
+    found = order[index.nearest(queries, 1)[1][:, 0]]
+    rows["ours"] |= {"cpu_ms": 1e3 * (time.process_time() - began) / count}
+    rows["ours"] |= {"nearest_found": float((found == nearest).double().mean())}
+    with contextlib.suppress(ImportError):
+        import faiss  # type: ignore[import-not-found, unused-ignore]
+
+        faiss.omp_set_num_threads(1)
+        began = time.process_time()
+        there = faiss.index_factory(known.shape[1], f"IVF{len(cells.centres)},SQ8_direct")
+        there.by_residual = False  # bytes as they are
+        there.train(known[: 20 * len(cells.centres)].float().numpy())
+        for part in known.split(2**16):
+            there.add(part.float().numpy())
+        rows["faiss"] = {"build_cpu_seconds": time.process_time() - began}
+        there.nprobe = 12
+        began = time.process_time()
+        numbers = there.search(queries.float().numpy(), 1)[1][:, 0]
+        rows["faiss"] |= {"cpu_ms": 1e3 * (time.process_time() - began) / count}
+        rows["faiss"] |= {"nearest_found": float((torch.from_numpy(numbers) == nearest).double().mean())}
+    return {"descriptors": size, "cells": len(cells.centres)} | rows
+
+
 # A building.
 
 
@@ -263,9 +305,9 @@ def exponent(rows: Sequence[Row], value: Callable[[Row], float]) -> float:
 
 
 def grown(rows: Sequence[Row]) -> dict[str, float]:
-    """Return the exponents of the CPU time of each step, and of all together; those below a tenth of a second count as that."""
+    """Return the exponents of the CPU time of each step and of all together, and of the memory."""
     found = {
-        step: exponent(rows, lambda row, step=step: max(0.1, row["steps"][step]["cpu_seconds"]))  # type: ignore[misc]
+        step: exponent(rows, lambda row, step=step: row["steps"][step]["cpu_seconds"])  # type: ignore[misc]
         for step in STEPS
     }
     together = exponent(rows, lambda row: row["cpu_seconds_a_photo"] * row["photos"])
@@ -348,6 +390,13 @@ def main() -> None:
             print(title, json.dumps(results[title]), flush=True)
             return results[title]
 
+        keypoints_of(max(buildings), keypoints)
+        for count in buildings:
+            folder = options.work / f"building-{count}"
+            measure(f"{count:,} photos", lambda _, count=count, folder=folder: alone(build, count, keypoints, folder))  # type: ignore[misc]
+        largest = options.work / f"building-{buildings[-1]}", buildings[-1] // PHOTOS, options.queries
+        measure(f"{buildings[-1]:,} photos, asked", lambda _: alone(ask_building, *largest), options.queries)
+        measure(f"{MAPS} maps", lambda _: alone(ask_many_maps, *largest), *largest[1:])
         for title, size, copies in [
             *((f"{size:,} landmarks", size, 1) for size in SIZES),
             (f"{COPIES} times there", SIZES[-1], COPIES),
@@ -360,22 +409,7 @@ def main() -> None:
                 *Scene.open(options.scene).key,
                 options.frames,
             )
-        keypoints_of(max(buildings), keypoints)
-        for count in buildings:
-            built = options.work / f"building-{count}"
-            measure(f"{count:,} photos", lambda _, count=count, built=built: alone(build, count, keypoints, built))  # type: ignore[misc]
-            measure(
-                f"{count:,} photos, asked",
-                lambda _, count=count, built=built: alone(ask_building, built, count // PHOTOS, options.queries),  # type: ignore[misc]
-                options.queries,
-            )
-        measure(
-            f"{MAPS} maps",
-            lambda _: alone(
-                ask_many_maps, options.work / f"building-{buildings[-1]}", buildings[-1] // PHOTOS, options.queries
-            ),
-            options.queries,
-        )
+        measure("search", lambda _: alone(search, options.others, SIZES[-1]), *options.others)
     first, last = (results[f"{size:,} landmarks"] for size in (SIZES[0], SIZES[-1]))
     results["times as long"] = last["median_cpu_seconds"] / first["median_cpu_seconds"]
     results["accepted at the largest"] = asdict(success_rate(last["accepted"], last["n"]))

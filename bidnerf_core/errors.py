@@ -96,6 +96,8 @@ def printable(text: str) -> str:
     writing direction), separators other than the space, and bytes that are not UTF-8. File and frame names
     may contain any of them.
     """
+    if text.isprintable():  # nearly always, and long texts are looked through a hundred times faster this way
+        return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 

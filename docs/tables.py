@@ -592,6 +592,106 @@ def gpu(records: Records) -> str:
     return _table(("what", "map", "time", ""), rows, records)
 
 
+# Large maps
+
+
+def _sizes(records: Records, unit: str) -> Iterator[tuple[str, Record]]:
+    """Yield the results of each size of a map, such as ``100,000 landmarks``."""
+    for title, found in records["large"].items():
+        if re.fullmatch(rf"[\d,]+ {unit}", title):
+            yield title, found
+
+
+@table
+def large_queries(records: Records) -> str:
+    """Queries of a scene among distractors."""
+    rows = []
+    copies = [(title, found) for title, found in records["large"].items() if title.endswith("times there")]
+    for title, found in [*_sizes(records, "landmarks"), *copies]:
+        name = f"{found['landmarks']:,}" + (f", the scene {title.removesuffix(' there')}" if "there" in title else "")
+        rows.append(
+            (
+                name,
+                f"{found['right']} of {found['n']}",
+                found["accepted"],
+                found["silent"],
+                _seconds(found["median_cpu_seconds"]),
+                f"{found['opened_cpu_seconds']:.1f} s",
+                f"{found['memory_MB']:.0f} MB",
+            )
+        )
+    head = ("landmarks", "right", "accepted", "of these wrong", "CPU time of a query", "opened in", "memory")
+    return _table(head, rows, records)
+
+
+@table
+def large_buildings(records: Records) -> str:
+    """What the landmarks of a building take, by the number of its photos, and the exponents of growth."""
+    rows = []
+    for title, found in _sizes(records, "photos"):
+        steps = [f"{found['steps'][step]['cpu_seconds']:.1f} s" for step in STEPS]
+        whole, memory = f"{found['cpu_seconds_a_photo']:.3f} s", f"{found['most_memory_MB'] / 1e3:.1f} GB"
+        rows.append((title.removesuffix(" photos"), *steps, whole, memory, f"{found['map_MB']:.0f} MB"))
+    grown = records["large"]["exponents"]
+    rows.append(("exponent", *(f"{grown[step]:.2f}" for step in (*STEPS, "all", "memory")), ""))
+    head = ("photos", *STEPS, "a photo", "most memory", "map")
+    return _table(head, rows, records)
+
+
+STEPS = ("pairs", "matches and tracks", "landmarks", "trial")
+"""The steps in which landmarks are made."""
+
+
+@table
+def large_answers(records: Records) -> str:
+    """Answers to new photos of the building, in one map, and in many maps at once."""
+    rows = []
+
+    def row(title: str, found: Record) -> None:
+        right = f"{found['right']} of {found['n']}"
+        time = _seconds(found["median_cpu_seconds"])
+        rows.append((title, right, found["accepted"], found["silent"], time))
+
+    for title, found in records["large"].items():
+        if title.endswith(" photos, asked"):
+            row(f"one map of {title.removesuffix(', asked')}", found)
+    for title, found in records["large"].items():
+        if title.endswith(" maps"):
+            row(f"{title} of the same photos, all at once", found["together"])
+            row("of these, the one that the photo shows", found["alone"])
+    return _table(("map", "right", "accepted", "of these wrong", "CPU time of a query"), rows, records)
+
+
+@table
+def large_projection(records: Records) -> str:
+    """What a million photos would take, if each further one took as much as those between the two largest sizes."""
+    *_, (_, former), (title, last) = _sizes(records, "photos")
+
+    def projected(value: Callable[[Record], float]) -> float:
+        each = (value(last) - value(former)) / (last["photos"] - former["photos"])
+        return value(last) + each * (1_000_000 - last["photos"])
+
+    rows = []
+    for step in STEPS:
+        minutes = projected(lambda found, step=step: found["steps"][step]["cpu_seconds"]) / 60  # type: ignore[misc]
+        rows.append((step, f"{minutes / 60:.1f} h" if minutes >= 60 else f"{minutes:.0f} min"))
+    for what, name in (("memory of one process", "most_memory_MB"), ("map on disk", "map_MB")):
+        rows.append((what, f"{projected(lambda found, name=name: found[name]) / 1e3:,.0f} GB"))  # type: ignore[misc]
+    return _table(("a million photos like these, in one map", f"projected from {title}, one core"), rows, records)
+
+
+@table
+def large_search(records: Records) -> str:
+    """Search of descriptors by the map's index and by faiss."""
+    found = records["large"]["search"]
+    rows = [
+        (title, f"{own['build_cpu_seconds']:.0f} s", f"{own['cpu_ms']:.2f} ms", f"{own['nearest_found']:.1%}")
+        for key, title in (("ours", "index of a map"), ("faiss", "faiss, `IVF,SQ8_direct`"))
+        if (own := found.get(key)) is not None
+    ]
+    return _table((f"{found['descriptors']:,} descriptors", "built in", "a keypoint", "nearest found"), rows, records)
+
+
 # The paper's experiments
 
 

@@ -53,6 +53,10 @@ def option_name(name: str) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return the exit status; a user error is reported in one line instead of a traceback."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    if (
+        arguments is None
+    ):  # processes that are started import no module from the current folder, which may hold anything
+        os.environ["PYTHONSAFEPATH"] = "1"
     _open_streams()
     name = "bidnerf"
     try:

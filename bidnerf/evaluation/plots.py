@@ -38,6 +38,7 @@ from bidnerf.results import (
     require_matplotlib,
     save_figure,
 )
+from bidnerf_core.errors import amount
 
 WIDTH, COLUMNS = 10.8, 3
 """Width of a figure in inches, and number of panels side by side."""
@@ -45,6 +46,10 @@ PER_INCH = 13
 """Average number of characters per inch of text."""
 MOST_SITUATIONS = 16
 """Maximum number of situations in a figure; larger figures can be neither drawn nor read."""
+MOST_CONDITIONS = 48
+"""Maximum number of conditions in a figure, whose legend has a line for each."""
+MOST_STEPS = 1_000
+"""Maximum number of steps at which quartiles are computed and drawn."""
 BOUND: dict[str, Any] = {"color": "#999", "linewidth": 0.8, "linestyle": (0, (4, 3))}
 """The line style of a bound."""
 
@@ -86,15 +91,18 @@ Figure = tuple[Path, str]
 class Figures:
     """Draws figures of ``groups`` and saves them as PNG and SVG in ``folder``. Raises ``InputError`` without matplotlib.
 
-    ``criterion`` defines success by step. At most ``MOST_SITUATIONS`` situations are drawn; if there are more, first those without faults.
+    ``criterion`` defines success by step. At most ``MOST_SITUATIONS`` situations and ``MOST_CONDITIONS`` conditions are drawn; if there
+    are more, first those without faults.
     """
 
     def __init__(self, groups: Sequence[ResultGroup], folder: Path, criterion: str) -> None:
         require_matplotlib()
         self.folder, self.criterion = folder, criterion
-        self.groups = sorted(groups, key=lambda group: group.situation.fault != NO_FAULT)
-        labels = dict.fromkeys(group.label for group in groups)
-        self.looks = {label: line_style(number) for number, label in enumerate(labels)}
+        labels = list(dict.fromkeys(group.label for group in groups))
+        self.looks = {label: line_style(number) for number, label in enumerate(labels[:MOST_CONDITIONS])}
+        self.undrawn = len(labels) - len(self.looks)
+        drawn = (group for group in groups if group.label in self.looks)
+        self.groups = sorted(drawn, key=lambda group: group.situation.fault != NO_FAULT)
 
     def errors(self) -> Figure | None:
         """Draw the cumulative share of trials over their errors, and that of right answers over time, for each situation."""
@@ -149,14 +157,16 @@ class Figures:
         label, _, bound, _ = QUANTITIES[kind]
         for group in groups:
             rows = [np.array(getattr(r.errors, kind), dtype=float) for r in group.results]
-            longest = max(map(len, rows))  # if a trial ended early, its last error is repeated
-            table = np.stack([np.pad(row, (0, longest - len(row)), mode="edge") for row in rows])
+            longest = max(map(len, rows))
+            steps = np.unique(np.linspace(0, longest - 1, MOST_STEPS).round().astype(int))
+            # If a trial ended early, its last error is repeated.
+            table = np.stack([row[np.minimum(steps, len(row) - 1)] for row in rows])
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", RuntimeWarning)  # no pose of a step was finite
                 low, middle, high = np.nanpercentile(table, (25, 50, 75), axis=0)
             look = self.looks[group.label]
-            axes.plot(middle, **look)
-            axes.fill_between(range(longest), low, high, color=look["color"], alpha=0.14, linewidth=0)
+            axes.plot(steps, middle, **look)
+            axes.fill_between(steps, low, high, color=look["color"], alpha=0.14, linewidth=0)
         axes.axhline(bound, **BOUND)
         axes.set(xlabel="step", ylabel=label.format(unit=common_unit(groups[0].results)))
         axes.set_xlim(left=0)
@@ -171,6 +181,8 @@ class Figures:
         panels, count = list[Panel](), len(situations(groups))
         if count > MOST_SITUATIONS:
             caption += f" At most {MOST_SITUATIONS} of {count} situations are drawn; the tables have all."
+        if self.undrawn:
+            caption += f" {amount(self.undrawn, 'further condition')} in the tables are not drawn."
         for situation in situations(groups)[:MOST_SITUATIONS]:
             own = [group for group in groups if group.situation == situation]
             panels += [(own[0].title, partial(each, groups=own)) for each in draw]
@@ -251,7 +263,7 @@ def comparison_figure(folder: Path, comparison: Comparison) -> Path:
     }
     titles = (comparison.title, "", "")
     panels: list[Panel] = [
-        (title, partial(draw, groups=groups)) for title, draw in zip(titles, figures.cumulative(), strict=True)
+        (title, partial(draw, groups=figures.groups)) for title, draw in zip(titles, figures.cumulative(), strict=True)
     ]
     panels += [(name, partial(bars, values=values)) for name, values in costs.items() if any(values)]
     return figures._figure("compare", panels, figures.looks, "")[0]

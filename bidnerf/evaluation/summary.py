@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import statistics
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -139,11 +140,16 @@ WORDS: dict[str, Callable[[Any], str]] = {
 def _labels(conditions: Sequence[dict[str, Any]]) -> dict[str, str]:
     """Return a label for each condition, by its JSON: the method, and the properties in which its conditions differ."""
     every = {json.dumps(condition, sort_keys=True): condition for condition in conditions}
-    labels = {}
+    groups, labels = defaultdict[str, list[dict[str, Any]]](list), {}
+    for own in every.values():
+        groups[own["method"]].append(own)
+    varying = {
+        method: {name for name in set().union(*same) if len({json.dumps(own.get(name)) for own in same}) > 1}
+        for method, same in groups.items()
+    }
     for key, own in every.items():
-        same = [other for other in every.values() if other["method"] == own["method"]]
         words = [own["method"]]
-        for name in (name for name in own if any(other.get(name) != own[name] for other in same)):
+        for name in (name for name in own if name in varying[own["method"]]):
             value = f"{own[name]:.12g}" if isinstance(own[name], float) else str(own[name]).lower()
             words.append(WORDS[name](own[name]) if name in WORDS else f"{name.replace('_', ' ')} {value}")
         labels[key] = ", ".join(words)

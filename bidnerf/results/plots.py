@@ -43,7 +43,10 @@ def require_matplotlib() -> Any:
 
 
 def common_style() -> Any:
-    """Return a context in which figures are drawn and saved in the common style."""
+    """Return a context in which figures are drawn and saved in the common style.
+
+    A matplotlibrc, which may lie in the current folder and make text run LaTeX, does not count.
+    """
     style = {
         "font.family": "DejaVu Sans",
         "font.size": 9,
@@ -64,7 +67,10 @@ def common_style() -> Any:
         "svg.hashsalt": "bidnerf",
         "text.parse_math": False,  # names may contain dollar signs
     }
-    return require_matplotlib().rc_context(style)
+    require_matplotlib()
+    from matplotlib.style import context
+
+    return context(style, after_reset=True)
 
 
 def new_figure(width: float, height: float) -> Any:

@@ -195,7 +195,8 @@ class Pool:
         ours, theirs = socket.socketpair()
         with theirs:
             process = subprocess.Popen(
-                [sys.executable, "-m", "bidnerf.service.worker", str(theirs.fileno())],
+                # -P: no module is imported from the current folder, which may hold anything.
+                [sys.executable, "-P", "-m", "bidnerf.service.worker", str(theirs.fileno())],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,  # Ctrl-C reaches only this process, which then ends the others

@@ -32,6 +32,8 @@ DERIVED = re.compile(
     r"(.+?)[_.-](depth|disp(arity)?|normals?|masks?|seg\w*|label\w*|conf\w*)([_.-]?(vis\w*|colou?r\w*))?", re.I
 )
 """The stem of a picture computed from a photo, whose stem is the first group."""
+MOST_FOLDERS = 2_000
+"""Maximum number of folders that are searched for photos, which takes some seconds."""
 
 
 @runtime_checkable
@@ -165,8 +167,15 @@ def _without_copies(folder: Path, photos: Sequence[Path]) -> list[Path]:
 
 
 def _subfolders(folder: Path, out: Path | None) -> Iterator[Path]:
-    """Yield the photos in subfolders of ``folder`` at any depth, except those of datasets and of auxiliary folders."""
-    for below, inside, _ in os.walk(folder):
+    """Yield the photos in subfolders of ``folder`` at any depth, except those of datasets and of auxiliary folders.
+
+    Raises ``InputError`` for a folder such as that of all files of a user, which would be searched for minutes.
+    """
+    for number, (below, inside, _) in enumerate(os.walk(folder)):
+        if number > MOST_FOLDERS:
+            raise InputError(
+                f"has more than {MOST_FOLDERS:,} subfolders", where=folder, expected="the folder of photos of one scene"
+            )
         inside[:] = sorted(
             name
             for name in inside

@@ -36,8 +36,9 @@ CANDIDATES = 16
 """Number of landmarks that a keypoint that votes for maps compares."""
 CLEAR = 0.9
 """Largest ratio of the distance to a landmark that a keypoint recognises and that to the last of its candidates."""
-RIVAL = 0.3
-"""Share of the votes of the best map with which another map may be the one that an image shows."""
+RIVAL, CERTAIN = 0.3, 0.05
+"""Share of the votes of the best map with which another map may be the one that an image shows, and share of all votes below which any
+may be."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +106,7 @@ class MapCollection:
     """Finds the map that an image shows, and the pose of the image in that map.
 
     The keypoints of an image vote for the maps whose landmarks they recognise. The image is localized in the map with the most votes,
-    and in others only if these have many votes as well, or if it is refused. Maps without landmarks cannot be ranked; all of them are
+    and in others only if these have nearly as many, or if none has many. Maps without landmarks cannot be ranked; all of them are
     tried last. Recently used maps stay in memory. A collection must be used from one thread only.
     """
 
@@ -201,8 +202,9 @@ class MapCollection:
     def __call__(self, frame: Frame, seed: int = 0) -> Placement:
         """Find the map that a frame shows, and the pose of the frame in that map.
 
-        If one map has far more votes than all others, the frame is localized there, and that is the answer unless it is refused.
-        Otherwise, the frame is localized with the landmarks of the most similar maps in turn until one map accepts it, and then in one
+        If a map has many votes, those with far fewer are not tried, since rooms that look alike would accept what the right one refuses.
+        The frame is localized by the full method in a single map that is left, and that is the answer unless it is refused. Otherwise,
+        the frame is localized with the landmarks of the most similar maps in turn until one map accepts it, and then in one
         more map, as a possible runner-up. The full method then localizes the frame in the best of the maps tried: among those that accept
         it, or among all if none does, the one with the most inliers.
         Raises ``InputError`` for a frame that cannot be localized at all.
@@ -210,13 +212,16 @@ class MapCollection:
         detectors = dict[str, CachedFeatures]()
         ranking = self._rank(frame, detectors)
         compared = [name for name, share in ranking.items() if share > -1.0]
+        bare = [name for name in ranking if name not in compared]
+        if compared and (most := ranking[compared[0]]) >= CERTAIN:
+            compared = [name for name in compared if ranking[name] >= RIVAL * most]
         full, quick = dict[str, Localization](), dict[str, Localization]()
-        if len(compared) > 1 and ranking[compared[1]] < RIVAL * ranking[compared[0]]:
+        if len(compared) == 1:
             best = compared[0]
             full[best] = found = self._in_map(best, frame, seed, detectors)
             if found.converged:
                 return Placement(best, found, None, ranking, (best,), self._infos[best].backend)
-        for name in [*compared[: self.limit], *(name for name in ranking if name not in compared)]:
+        for name in [*compared[: self.limit], *bare]:
             recognised = any(found.converged for found in quick.values())
             quick[name] = full[name] if name in full else self._in_map(name, frame, seed, detectors, quick=True)
             if recognised:

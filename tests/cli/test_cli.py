@@ -647,3 +647,15 @@ def test_localizing_imports_nothing_that_only_other_work_needs() -> None:
     imported = {*quietly([sys.executable, "-c", program]).split()}
     assert "bidnerf_core.maps.localizer" in imported
     assert not {*others.split()} & imported
+
+
+def test_what_the_program_starts_imports_nothing_from_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "multiprocessing.py").write_text("raise SystemExit('imported')\n")
+    monkeypatch.setenv("PYTHONSAFEPATH", "")
+    monkeypatch.setattr(sys, "argv", ["bidnerf", "--version"])
+    words = [sys.executable, "-c", "import multiprocessing.spawn"]  # as a pool of processes starts its workers
+    assert subprocess.run(words, cwd=tmp_path, capture_output=True).returncode == 1
+    assert main() == 0
+    assert subprocess.run(words, cwd=tmp_path, capture_output=True).returncode == 0

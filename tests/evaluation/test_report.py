@@ -37,7 +37,7 @@ from bidnerf.evaluation import (
 from bidnerf.evaluation.plots import Figures
 from bidnerf.evaluation.report import render_page
 from bidnerf.evaluation.summary import situation_titles, situations
-from bidnerf.results import success_rate_by_frame
+from bidnerf.results import require_matplotlib, success_rate_by_frame
 from bidnerf_core.datasets import DatasetOptions, write_transforms
 from bidnerf_core.errors import InputError
 from commands import Run, assert_refused
@@ -446,3 +446,26 @@ def test_the_worst_frames_are_shown_as_the_method_received_them(tmp_path: Path) 
     assert main(["report", str(file), "--out", str(tmp_path / "b"), "--data", str(tmp_path / "photo")]) == 1
     assert main(["report", str(file), "--out", str(tmp_path / "c")]) == 0
     assert "image/jpeg" not in (tmp_path / "c" / "index.html").read_text()
+
+
+def test_no_figure_has_more_conditions_or_steps_than_can_be_drawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bidnerf.evaluation.plots.MOST_CONDITIONS", 3)
+    many = [dataclasses.replace(result(seed, 2), method=f"method {seed}") for seed in range(8)]
+    trace = Trace((1.0,) * 200_000, (1.0,) * 200_000)
+    long = [dataclasses.replace(each, errors=trace, steps=199_999) if each.seed == 1 else each for each in many]
+    figures = Figures(ResultTable(tuple(long)).groups, tmp_path, "5deg 0.05")
+    drawn = figures.convergence()
+    assert drawn is not None
+    assert "5 further conditions in the tables are not drawn" in drawn[1]
+    assert len(drawn[0].read_bytes()) < 200_000  # every step would take megabytes
+    assert [group.label for group in figures.groups] == ["method 0", "method 1", "method 2"]
+
+
+def test_settings_of_matplotlib_do_not_count(tmp_path: Path) -> None:
+    matplotlib = require_matplotlib()
+    with matplotlib.rc_context({"text.usetex": True, "figure.dpi": 1e9}):
+        figure = Figures(ResultTable((result(0, 2),)).groups, tmp_path, "5deg 0.05").errors()
+    assert figure is not None
+    assert figure[0].stat().st_size > 1000

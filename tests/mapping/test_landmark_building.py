@@ -128,6 +128,13 @@ def test_the_best_seen_are_kept_and_the_rest_is_reported() -> None:
     assert len(found) == 50
     assert f"{len(everything)} landmarks found, 50 kept" in said[0]
     assert int(found.views.min()) >= int(everything.views.sort(descending=True).values[49])
+    # Of more than a thousand images, as many more are kept.
+    tracked = track_views(views, points)
+    first = tracked.observations.images[0]
+    empty = replace(first, keypoints=first.keypoints[torch.arange(0)], rays=first.rays[:0], depth=first.depth[:0])
+    images = [*tracked.observations.images, *[empty] * (2000 - len(views))]
+    many = replace(tracked, observations=replace(tracked.observations, images=images))
+    assert len(many.landmarks(LandmarkConfig(most=50))) == 100
 
 
 def test_progress_ends_at_its_total() -> None:

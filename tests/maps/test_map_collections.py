@@ -26,6 +26,7 @@ from bidnerf_core.captures import stored_cameras
 from bidnerf_core.fields import NoField
 from bidnerf_core.mapping import BakeConfig, Sift, bake, build_landmarks
 from bidnerf_core.maps import Map, MapInfo, maps_in, name_maps
+from bidnerf_core.maps.collection import Ballot
 from commands import Run
 from localizations import answer
 from optional import require
@@ -124,6 +125,19 @@ def test_the_service_finds_the_map_of_a_photo(grounds: list[Map], tmp_path: Path
     assert body["runner_up"] is None
     alone = worker.answer(task | {"map": "b"}, tmp_path)["body"]
     assert alone["T_world_camera"] == body["T_world_camera"]
+
+
+def test_what_looks_alike_in_many_maps_has_no_vote() -> None:
+    """Forty maps show the same furniture; each has pictures of its own, but for two maps of one room."""
+    generator = torch.Generator().manual_seed(0)
+    shape = (42, 60, 128)
+    furniture, *pictures = torch.randint(60, shape, generator=generator).byte()
+    pictures[7] = pictures[8]
+    ballot = Ballot.of([torch.cat([furniture, own]) for own in pictures[:40]])
+    assert float(ballot.shares(furniture, 40).max()) == 0
+    assert ballot.shares(torch.cat([furniture, pictures[3]]), 40).nonzero().tolist() == [[3]]
+    assert ballot.shares(pictures[8], 40).tolist() == [float(number in (7, 8)) for number in range(40)]
+    assert float(ballot.shares(pictures[40], 40).max()) < 0.1  # of a room in no map
 
 
 def test_maps_without_landmarks_come_last(grounds: list[Map]) -> None:

@@ -25,6 +25,7 @@ from typing import Any, TypeAlias
 
 import imageio.v3 as iio
 import numpy as np
+import psutil
 import torch
 from safetensors import safe_open
 
@@ -43,7 +44,10 @@ AUTO_SETTINGS: dict[str, Any] = {"points": 100, "hypotheses": 8, "rounds": 1, "r
 AUTO = [word for name, value in AUTO_SETTINGS.items() for word in (f"--{name.replace('_', '-')}", str(value))]
 BAKED = ["--cells", "2000"]
 SECONDS, MEMORY = 25.0, 2 * 2**30
-"""Limits of a case: wall time, and address space beyond that of the process before it."""
+"""Limits of a case: time, and address space beyond that of the process before it.
+
+The time is that of its processor, on which other processes do not count; one that waits for something may take four times as long.
+"""
 NOBODY = 65534
 TEMPORARY = re.compile(r"\..+\.[0-9a-f]{8}")
 
@@ -209,7 +213,8 @@ def end(child: int, log: Path, seconds: float = SECONDS) -> Outcome:
     began = time.monotonic()
     while True:
         found, status = os.waitpid(child, os.WNOHANG)
-        late = time.monotonic() - began > seconds
+        waited = time.monotonic() - began
+        late = waited > seconds and (waited > 4 * seconds or cpu_seconds(child) > seconds)
         if found or late:
             break
         time.sleep(0.005)
@@ -224,6 +229,15 @@ def end(child: int, log: Path, seconds: float = SECONDS) -> Outcome:
         for path in (log.with_suffix(".out"), log.with_suffix(".err"))
     )
     return Outcome(ending, out, err, time.monotonic() - began, code)
+
+
+def cpu_seconds(child: int) -> float:
+    """Return the processor time of a process and of those that it began."""
+    total = 0.0
+    with contextlib.suppress(psutil.Error):
+        for process in (own := psutil.Process(child), *own.children(recursive=True)):
+            total += sum(process.cpu_times())
+    return total
 
 
 def run(door: Door, log: Path, seconds: float = SECONDS, **options: Any) -> Outcome:

@@ -169,7 +169,8 @@ def kill(job: Job, work: Path, expected: object, seconds: float, kills: int, cha
         found = stop(job, folder, signal.SIGKILL, chance.uniform(0, 1.1 * seconds))
         wrong = damage_of(job, folder, before)
         before = 0 if wrong else job.kept(folder)
-        if found.ending == "done":
+        # Resuming is refused after a kill between the last write and the end of the process.
+        if found.ending == "done" or "nothing to resume" in found.last:
             wrong += [] if job.result(folder) == expected else [OTHER_RESULT]
             rounds, before = rounds + 1, 0
             folder = work / str(rounds)

@@ -822,6 +822,15 @@ def test_what_is_no_map_is_refused_before_torch_is_imported() -> None:
     assert found.stderr.startswith("bidnerf serve: nomap: no such folder, expected a map")
 
 
+def test_the_process_with_the_maps_imports_nothing_from_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "runpy.py").write_text("raise SystemExit(9)\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="no such folder"):  # not: the process died
+        asyncio.run(service_app("nomap").state.pool.start())
+
+
 def test_startup_of_another_server_starts_the_pool(monkeypatch: pytest.MonkeyPatch) -> None:
     """An ASGI server starts the workers and ends them by events, which are not requests and carry no token."""
     app, start, close, send = service_app("MAP", token="0123456789abcdef"), AsyncMock(), AsyncMock(), AsyncMock()

@@ -100,3 +100,11 @@ def test_pictures_whose_edges_continue_each_other_are_panoramas_without_xmp(tmp_
         ramp = np.linspace(0, 255, 120)[None].repeat(60, 0)[..., None].repeat(3, 2)
         Image.fromarray(ramp.astype(np.uint8)).save(tmp_path / f"{number}.png")
     refuse_panoramas(files(tmp_path))
+
+
+def test_a_whole_disk_is_not_searched_for_photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bidnerf_core.datasets.unposed.MOST_FOLDERS", 20)
+    for number in range(21):
+        (tmp_path / f"{number}").mkdir()
+    with refused(where=tmp_path, found="more than 20 subfolders", expected="the folder of photos of one scene"):
+        photos_of(tmp_path)

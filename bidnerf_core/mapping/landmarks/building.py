@@ -56,7 +56,7 @@ from bidnerf_core.settings import Above, Range, Settings
 
 LEAST_VISIBLE_POINTS = 20
 """Minimum number of points from which the pose of an image is estimated."""
-SETTLED = 0.25
+SETTLED_PIXELS = 0.25
 """Motion of points in an image (pixels) up to which the matches of a pair are kept when poses change: an eighth of the epipolar band."""
 SAMPLE = 32
 """Number of points from which that motion is estimated; images that see fewer than a quarter of it are matched again."""
@@ -322,7 +322,7 @@ def _settled(
     earlier = SE3(change.rotation[:, None], change.translation[:, None]).apply(local)
     away = torch.linalg.vector_norm(pinhole(earlier)[0] - pinhole(local)[0], dim=-1).median(1).values
     pixels = away * torch.tensor([images[j].focal for _, j in both], dtype=away.dtype)
-    return [pair for pair, moved in zip(both, pixels.tolist(), strict=True) if moved <= SETTLED]
+    return [pair for pair, moved in zip(both, pixels.tolist(), strict=True) if moved <= SETTLED_PIXELS]
 
 
 def detect_keypoints(views: Sequence[View], features: Features) -> list[ImageKeypoints]:
