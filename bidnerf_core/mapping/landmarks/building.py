@@ -58,7 +58,7 @@ LEAST_VISIBLE_POINTS = 20
 """Minimum number of points from which the pose of an image is estimated."""
 SETTLED_PIXELS = 0.25
 """Motion of points in an image (pixels) up to which the matches of a pair are kept when poses change: an eighth of the epipolar band."""
-SAMPLE = 32
+SAMPLED_POINTS = 32
 """Number of points from which that motion is estimated; images that see fewer than a quarter of it are matched again."""
 ENOUGH_IMAGES = 8
 """Minimum number of images from which the covariance of pose updates is estimated."""
@@ -298,10 +298,10 @@ def _link_keypoints(
 def _samples(seen: TrackedKeypoints, points: Float[Tensor, "n 3"]) -> Float[Tensor, "v s 3"]:
     """Return evenly spread ``points`` that each image sees, in its camera frame (metres), or NaN if it sees too few."""
     counts = torch.bincount(seen.image, minlength=len(seen.images))
-    rank = torch.arange(SAMPLE) * counts[:, None] // SAMPLE + (counts.cumsum(0) - counts)[:, None]
+    rank = torch.arange(SAMPLED_POINTS) * counts[:, None] // SAMPLED_POINTS + (counts.cumsum(0) - counts)[:, None]
     local = seen.sightings.in_camera(points)[seen.image.argsort(stable=True)]
     samples = torch.full((*rank.shape, 3), torch.nan, dtype=local.dtype)
-    enough = counts >= SAMPLE / 4
+    enough = counts >= SAMPLED_POINTS / 4
     samples[enough] = local[rank[enough]]
     return samples
 
