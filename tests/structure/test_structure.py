@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import sys
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -45,7 +47,7 @@ from bidnerf_core.geometry import fit_similarity, look_at
 
 # Inside: each stage of the search for poses, with its rare geometry
 from bidnerf_core.maps.training import open_posed_images, poses_folder
-from bidnerf_core.progress import job_context
+from bidnerf_core.progress import Progress, job_context
 from commands import Run
 from optional import require
 from photo_files import write_photo
@@ -232,6 +234,25 @@ def test_keypoints_are_detected_where_the_job_says(search: Search, tmp_path: Pat
         bn.find_poses(search.photos, tmp_path / "out", **stopping_at("matching photos"))
     readable = sorted(photo.name for photo in search.photos.iterdir() if photo.name != "202.jpg")
     assert tasks == readable
+
+
+def test_a_cluster_whose_worker_is_killed_places_the_same_photos(search: Search) -> None:
+    distributed = pytest.importorskip("distributed")
+    killed = list[int]()
+
+    def kill_a_worker(now: Progress) -> None:
+        if now.stage == "matching photos" and not killed:
+            killed.append(local.workers[0].process.pid)
+            os.kill(killed[0], signal.SIGKILL)
+
+    out = search.out.with_name("poses of a cluster")
+    with (
+        distributed.LocalCluster(2, threads_per_worker=1, processes=True, dashboard_address=None) as local,
+        bn.cluster(local.scheduler_address),
+    ):
+        bn.find_poses(search.photos, out, progress=kill_a_worker)
+    assert killed
+    assert (out / "transforms.json").read_bytes() == (search.out / "transforms.json").read_bytes()
 
 
 def test_what_has_no_photos_or_has_poses(search: Search, tmp_path: Path, bidnerf: Run) -> None:
