@@ -48,7 +48,7 @@ MOST_SITUATIONS = 16
 """Maximum number of situations in a figure; larger figures can be neither drawn nor read."""
 MOST_CONDITIONS = 48
 """Maximum number of conditions in a figure, whose legend has a line for each."""
-MOST_STEPS = 1_000
+PLOTTED_STEPS = 1_000
 """Maximum number of steps at which quartiles are computed and drawn."""
 BOUND: dict[str, Any] = {"color": "#999", "linewidth": 0.8, "linestyle": (0, (4, 3))}
 """The line style of a bound."""
@@ -158,7 +158,7 @@ class Figures:
         for group in groups:
             rows = [np.array(getattr(r.errors, kind), dtype=float) for r in group.results]
             longest = max(map(len, rows))
-            steps = np.unique(np.linspace(0, longest - 1, MOST_STEPS).round().astype(int))
+            steps = np.unique(np.linspace(0, longest - 1, PLOTTED_STEPS).round().astype(int))
             # If a trial ended early, its last error is repeated.
             table = np.stack([row[np.minimum(steps, len(row) - 1)] for row in rows])
             with warnings.catch_warnings():
