@@ -87,10 +87,8 @@ def chosen_pairs(descriptors: Sequence[np.ndarray], candidates: Pairs) -> Pairs:
     if len(descriptors) <= EXHAUSTIVE:
         return candidates
     count = counter("comparing photos", "photos")
-    largest, votes = (
-        [own[:VOTING_KEYPOINTS] for own in descriptors],
-        np.zeros((len(descriptors), len(descriptors)), np.int32),
-    )
+    largest = [own[:VOTING_KEYPOINTS] for own in descriptors]
+    votes = np.zeros((len(descriptors), len(descriptors)), np.int32)
     grouped = [(i, [j for _, j in pairs]) for i, pairs in groupby(candidates, lambda pair: pair[0])]
     tasks: Any = map_tasks(_votes, ((largest[i], [largest[j] for j in others]) for i, others in grouped))
     with closing(tasks) as results:

@@ -38,7 +38,7 @@ from bidnerf.service import (
     validate,
 )
 from bidnerf.viewer.answer import no_answer
-from bidnerf.viewer.pages import MapView, answer_query, require_map
+from bidnerf.viewer.pages import MapView, answer_query, single_map
 from bidnerf.viewer.pictures import JsonObject, field_image, jpeg, quick_image
 from bidnerf.viewer.scene import map_json, thumbnail
 from bidnerf_core.camera import CameraSource, Intrinsics
@@ -182,7 +182,7 @@ def viewer_app(live: LiveView, token: str | None = None, limits: ServiceLimits |
     Without a ``token``, only requests addressed to localhost are answered.
     """
     limits = limits or ServiceLimits()
-    scene, source = require_map(live.localizer), live.source
+    scene, source = single_map(live.localizer), live.source
     names = () if source is None else tuple(source.names)
     usual = replace(live.camera or CameraSource(), assumed=live.localizer.assumed_cameras)
     others = replace(usual, hfov=None)  # the page sends the field of view

@@ -109,7 +109,7 @@ def view(
     localizer with its own settings, and ``trajectory`` is a file of poses. Raises ``InputError`` if ``scene`` is
     neither a map nor a localizer, and for a frame that cannot be localized at all.
     """
-    scene_map = require_map(scene)
+    scene_map = single_map(scene)
     answers = list[JsonObject]()
     if localization is not None:
         answer = answer_json(scene_map, "localization" if frame is None else frame.name, localization, frame)
@@ -129,7 +129,7 @@ def view(
     )
 
 
-def require_map(scene: object) -> Map:
+def single_map(scene: object) -> Map:
     """Return the given map, or the map of a localizer. Raises ``InputError`` for anything else."""
     scene = scene.scene if isinstance(scene, Localizer) else scene
     if not isinstance(scene, Map):
