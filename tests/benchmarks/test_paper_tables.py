@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -33,13 +33,6 @@ CELLS = {
     "inerf": (2, 1, 25, {"bid", "inerf"}),
     "parallel": (2, 1, 25, {"bid", "inerf"}),
 }
-
-
-@pytest.fixture(autouse=True, scope="module")
-def protocols() -> Iterator[None]:
-    """The script adds a protocol, which is removed after the last test."""
-    yield
-    PROTOCOLS.pop("parallel", None)
 
 
 @pytest.mark.parametrize("part", CELLS)
