@@ -154,11 +154,20 @@ class Loop:
         """Refine a proposal under all explanations, fuse all measurements, and judge the pose; None if too few matches agree."""
         scale = 0.0 if self.problem is None else DEPTH_WIDTH * self.problem.sensor.scale
         given = explanations(self.query, self.landmarks, proposal.distance, scale, self.moving)
-        modes, states = ModeSearch(self.query, self.matcher, given, self.device)(nearest, proposal, nfa, searched)
-        if not modes:
-            return None
-        states, term = run_on(self.device, weigh, states, term_of(modes, states, self.landmarks, self.device))
-        return self._fused(modes, states, term, given, searched)
+        first, answer = nearest.best, None
+        for _ in range(2):
+            search = ModeSearch(self.query, self.matcher, given, self.device)
+            modes, states = search(nearest, first, proposal, nfa, searched)
+            if not modes:
+                break
+            states, term = run_on(self.device, weigh, states, term_of(modes, states, self.landmarks, self.device))
+            answer = self._fused(modes, states, term, given, searched)
+            # If another place is the most probable one, the places that look like it compete with it, not those that look like the first.
+            if answer.posterior.mode == 0 or answer.mode.mirrored:
+                break
+            chosen, first, nfa = answer.posterior.chosen, answer.mode.by_descriptors, answer.evidence.log10_nfa
+            proposal = Proposal(answer.mode.name, chosen.T[0], chosen.nuisances[0, :6], answer.distance)
+        return answer
 
     def nearest(self, strongest: int) -> Nearest:
         """Return the landmarks most similar to each image's strongest keypoints, of which at most ``strongest`` are used."""

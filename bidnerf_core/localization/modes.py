@@ -63,18 +63,20 @@ class ModeSearch:
     given: Explanations
     device: torch.device
 
-    def __call__(self, nearest: Nearest, proposal: Proposal, nfa: float, searched: bool) -> tuple[list[Mode], States]:
+    def __call__(
+        self, nearest: Nearest, matches: Matches, proposal: Proposal, nfa: float, searched: bool
+    ) -> tuple[list[Mode], States]:
         """Return the modes and the most probable state of each mode; no mode if too few matches agree with the proposal.
 
-        ``nfa`` is log10 of the number of false alarms of the proposal. If the proposal was ``searched`` for among the matches by
+        ``nfa`` is log10 of the number of false alarms of the proposal. If the proposal was ``searched`` for among the ``matches`` by
         descriptors, those that agree with it are used at first; otherwise, landmarks are matched by projection.
         """
-        first = self._agreeing(Mode(proposal.name, self.query, nearest.best, nearest.best), proposal, searched)
+        first = self._agreeing(Mode(proposal.name, self.query, matches, matches), proposal, searched)
         if first is None:
             return [], States.known(proposal.T, proposal.camera)
         if searched:
             first = first[0], self._warped(first[0], proposal, first[1])
-        others = (self._agreeing(mode, there, True) for mode, there in self._others(nearest, nfa, first[1]))
+        others = (self._agreeing(mode, there, True) for mode, there in self._others(nearest, matches, nfa, first[1]))
         modes, best = map(list, zip(first, *(other for other in others if other is not None), strict=True))
         seen: list[Projected | None] = [None] * len(modes)
         for radius in RADII:
@@ -131,7 +133,7 @@ class ModeSearch:
         more = int(inliers(query, self.matcher.landmarks, found, state).sum())
         return state if more > 1.3 * agreeing else best
 
-    def _others(self, nearest: Nearest, nfa: float, best: States) -> Iterator[tuple[Mode, Proposal]]:
+    def _others(self, nearest: Nearest, matches: Matches, nfa: float, best: States) -> Iterator[tuple[Mode, Proposal]]:
         """Yield the hypotheses that compete with the place of the state ``best``.
 
         A scene may be repetitive, such as two rooms with the same furniture: keypoints that agree with the state may agree as well with
@@ -144,6 +146,7 @@ class ModeSearch:
         near = inliers(query, landmarks, every, best, RADII[0]).view(q, k)
         agreeing = torch.zeros(len(query.view), dtype=torch.bool)
         agreeing[nearest.keypoint] = near[:, 0]
+        agreeing[matches.keypoint[inliers(query, landmarks, matches, best, RADII[0])]] = True
         others = nearest.others(near)
         others = others[agreeing[others.keypoint]]
         # Another place has at least three tenths as many inliers as the first.

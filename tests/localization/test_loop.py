@@ -24,6 +24,9 @@ from bidnerf.testing import GROUND_CAMERA, TexturedGround, textured_map, texture
 from bidnerf.testing import POSES as GROUND_POSES
 from bidnerf_core.fields import FieldValues
 from bidnerf_core.localization import AutoConfig, LandmarkAnswer, LandmarkMatcher, LogisticModel, Loop, rig
+from bidnerf_core.localization.matching import STRONGEST
+from bidnerf_core.localization.propose import proposal_at
+from bidnerf_core.mapping import concatenate
 from bidnerf_core.registry import registered
 from conditions import (
     COPY,
@@ -369,6 +372,24 @@ def test_a_pose_found_by_other_means_is_confirmed_or_contradicted() -> None:
     assert_near(there.T_world_rig, TRUTH, 0.02, 0.5)
     wrong = loop.at(TRUTH.retract(torch.tensor([0.3, 0.2, 0.0, 0.0, 0.0, 0.8], dtype=torch.float64)))
     assert wrong is None or not wrong.verdict.accepted
+
+
+def test_another_place_competes_with_the_places_that_look_like_it_not_like_the_first() -> None:
+    """The first pose, in a room that shares little, is not the most probable one; that one is in either of two equal rooms."""
+    seen, rooms, T = points(), twice(point_landmarks()), COPY @ COPY
+    few, elsewhere = point_landmarks()[torch.arange(120)], T.to(dtype=torch.float32)
+    noise = 20 * torch.randn(few.descriptors.shape, generator=torch.Generator().manual_seed(1))
+    few = replace(
+        few,
+        positions=elsewhere.apply(few.positions),
+        directions=elsewhere.rotate(few.directions),
+        descriptors=(few.descriptors + noise).round().clamp(0, 255).byte(),
+    )
+    matching = LandmarkMatcher(concatenate([rooms, few]))
+    loop = Loop([point_view(seen, POSES[0])], matching, features=seen)
+    proposal = proposal_at("landmarks", T, few)
+    found = require(loop.answer(proposal, loop.nearest(STRONGEST), -10.0))
+    assert found.verdict.outcome is Outcome.AMBIGUOUS
 
 
 # One image, once
