@@ -7,7 +7,6 @@ and matches are tasks of the job's executor, such as a cluster.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -16,13 +15,11 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch
-from jaxtyping import Int, UInt8
 from scipy.spatial import cKDTree
-from torch import Tensor
 
 from bidnerf.structure.colmap import PhotoSet, import_pycolmap
 from bidnerf_core.devices import map_tasks
-from bidnerf_core.mapping import Vocabulary, squared_distances
+from bidnerf_core.mapping import Vocabulary, mutual_matches
 from bidnerf_core.progress import counter
 
 EXHAUSTIVE = 60
@@ -35,13 +32,6 @@ VOTING_KEYPOINTS = 500
 """Number of a photo's largest keypoints that vote for its candidates. They stay visible when the distance changes."""
 PARTNERS = 12
 """Number of candidates with the most votes with which a photo is matched; with those that choose it, there are about 18."""
-RATIO = 0.8
-"""Largest ratio of the distances to the nearest and the second-nearest keypoint of a match (Lowe 2004)."""
-FARTHEST_MATCH = 2 * (1 - math.cos(0.7)) * 512**2
-"""Largest squared distance of a match: descriptors 0.7 radians apart, as in COLMAP; their norm is 512."""
-MATCHED_ROWS = 256
-"""Number of keypoints whose distances to all of another photo are computed at a time, which fit the processor's cache."""
-
 Pairs: TypeAlias = list[tuple[int, int]]
 """Pairs (i, j) of photos with i < j."""
 
@@ -82,7 +72,7 @@ def candidate_pairs(descriptors: Sequence[np.ndarray], positions: np.ndarray | N
 def chosen_pairs(descriptors: Sequence[np.ndarray], candidates: Pairs) -> Pairs:
     """Return the pairs of photos to match: of few photos all, else each photo's ``candidates`` with the most votes.
 
-    The votes are the mutual nearest neighbours among the largest keypoints that pass the ratio test.
+    The votes are the matches (``mutual_matches``) among the largest keypoints.
     """
     if len(descriptors) <= EXHAUSTIVE:
         return candidates
@@ -102,29 +92,7 @@ def chosen_pairs(descriptors: Sequence[np.ndarray], candidates: Pairs) -> Pairs:
 
 def _votes(own: np.ndarray, others: Sequence[np.ndarray]) -> list[int]:
     """Return the number of keypoints of a photo that each of the ``others`` shows as well, judging by descriptors (n, 128)."""
-    return [len(mutual_matches(torch.tensor(own), torch.tensor(other))) for other in others]
-
-
-def mutual_matches(a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"]) -> Int[Tensor, "p 2"]:
-    """Return the pairs of descriptors that are each other's nearest, and far nearer than the second-nearest of both."""
-    if min(len(a), len(b)) < 2:
-        return torch.zeros((0, 2), dtype=torch.long)
-    nearest, partner, second = torch.empty(len(a)), torch.empty(len(a), dtype=torch.long), torch.empty(len(a))
-    least, others = torch.full((len(b),), torch.inf), b.float()
-    for rows in torch.arange(len(a)).split(MATCHED_ROWS):
-        distances = squared_distances(a[rows], others)
-        least = least.minimum(distances.amin(0))
-        nearest[rows], partner[rows] = distances.min(1)
-        second[rows] = distances.scatter_(1, partner[rows, None], torch.inf).amin(1)
-    is_match = (nearest == least[partner]) & (nearest < RATIO**2 * second) & (nearest < FARTHEST_MATCH)
-    numbers = is_match.nonzero()[:, 0]
-    returned = squared_distances(others[partner[numbers]], a)
-    returned.scatter_(1, numbers[:, None], torch.inf)
-    numbers = numbers[nearest[numbers] < RATIO**2 * returned.amin(1)]
-    # Of equal descriptors, the first one
-    first = torch.full((len(b),), len(a)).scatter_reduce(0, partner[numbers], numbers, "amin")
-    numbers = numbers[first[partner[numbers]] == numbers]
-    return torch.stack([numbers, partner[numbers]], dim=-1)
+    return [len(mutual_matches(torch.tensor(own), torch.tensor(other))[0]) for other in others]
 
 
 def match(database: Any, photos: PhotoSet, pairs: Pairs, pycolmap: Any) -> None:
@@ -160,7 +128,7 @@ def _geometries(own: StoredKeypoints, others: Sequence[StoredKeypoints]) -> list
     verification.ransac.random_seed = 0
     descriptors, geometries = torch.tensor(own.descriptors), []
     for other in others:
-        matches = mutual_matches(descriptors, torch.tensor(other.descriptors)).numpy()
+        matches = torch.stack(mutual_matches(descriptors, torch.tensor(other.descriptors)), dim=-1)
         ends = own.camera, own.pixels, other.camera, other.pixels
-        geometries.append(pycolmap.estimate_two_view_geometry(*ends, matches.astype(np.uint32), verification))
+        geometries.append(pycolmap.estimate_two_view_geometry(*ends, matches.numpy().astype(np.uint32), verification))
     return geometries

@@ -17,12 +17,12 @@ from functools import cache, partial
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float
 from kornia.geometry.conversions import quaternion_to_rotation_matrix, rotation_matrix_to_quaternion
 from torch import Tensor
 
 from bidnerf_core.geometry import SE3
-from bidnerf_core.mapping import LEAST_BASELINE, ImageKeypoints, likely_pairs, mutual_nearest, squared_distances
+from bidnerf_core.mapping import LEAST_BASELINE, ImageKeypoints, likely_pairs, mutual_matches
 
 MOST_PAIRS = 40
 """Largest number of image pairs examined from those suggested by poses and image order, and again from those
@@ -161,7 +161,7 @@ def _similar(images: Sequence[ImageKeypoints]) -> list[tuple[int, int]]:
     chosen = range(0, len(images), max(1, -(-len(images) // 60)))
     strongest = [images[i].keypoints.descriptors[:300] for i in chosen]
     counts = {
-        (a, b): len(_unambiguous(strongest[a], strongest[b])[0])
+        (a, b): len(mutual_matches(strongest[a], strongest[b])[0])
         for a, b in itertools.combinations(range(len(chosen)), 2)
     }
     selected = set[tuple[int, int]]()
@@ -171,21 +171,10 @@ def _similar(images: Sequence[ImageKeypoints]) -> list[tuple[int, int]]:
     return [(chosen[a], chosen[b]) for a, b in sorted(selected, key=lambda pair: -counts[pair])]
 
 
-def _unambiguous(a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"]) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
-    """Return the indices of descriptors that are mutual nearest neighbours and pass the ratio test of Lowe 2004."""
-    if min(len(a), len(b)) < 2:
-        return torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.long)
-    distance = squared_distances(a, b)
-    nearest = distance.topk(2, largest=False).values
-    rows, partner = mutual_nearest(distance)
-    passed = nearest[rows, 0] < 0.8**2 * nearest[rows, 1]
-    return rows[passed], partner[passed]
-
-
 def match_pair(images: Sequence[ImageKeypoints], i: int, j: int) -> MatchedPair | None:
     """Return the matches of two images that are inliers of an essential matrix; None if there are too few."""
     a, b = images[i], images[j]
-    rows, partner = _unambiguous(a.keypoints.descriptors, b.keypoints.descriptors)
+    rows, partner = mutual_matches(a.keypoints.descriptors, b.keypoints.descriptors)
     if len(rows) < ENOUGH_MATCHES:
         return None
     first, second, focal = a.rays[rows], b.rays[partner], min(a.focal, b.focal)

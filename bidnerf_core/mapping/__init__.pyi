@@ -20,6 +20,7 @@ from .landmarks.descriptors import DescriptorCells as DescriptorCells
 from .landmarks.descriptors import HalfPrecisionSearch as HalfPrecisionSearch
 from .landmarks.descriptors import InvertedFile as InvertedFile
 from .landmarks.descriptors import byte_of_zero as byte_of_zero
+from .landmarks.descriptors import mutual_matches as mutual_matches
 from .landmarks.descriptors import mutual_nearest as mutual_nearest
 from .landmarks.descriptors import nearest_centre as nearest_centre
 from .landmarks.descriptors import paired_squared_distances as paired_squared_distances

@@ -23,6 +23,7 @@ from bidnerf_core.mapping import (
     detect,
     image_keypoints,
     limit_features,
+    mutual_matches,
     nearest_centre,
     paired_squared_distances,
     quantize,
@@ -65,6 +66,27 @@ def test_distances_of_bytes_are_exact(generator: torch.Generator) -> None:
     assert torch.equal(squared_distances(a, b).long(), expected)
     rows, columns = torch.tensor([0, 3, 6]), torch.tensor([8, 1, 0])
     assert torch.equal(paired_squared_distances(a, b, rows, columns).long(), expected[rows, columns])
+
+
+@pytest.mark.parametrize(("n", "m"), [(700, 300), (2, 600), (600, 1), (0, 5), (5, 0)])
+def test_matches_are_mutual_and_unambiguous_in_both_directions(n: int, m: int, generator: torch.Generator) -> None:
+    b = torch.randint(0, 256, (m, 8), generator=generator).byte()
+    copies = torch.randint(0, max(m, 1), (n,), generator=generator)
+    noise = torch.randint(0, 40, (n, 8), generator=generator)
+    a = (b[copies].long() + noise).clamp(max=255).byte() if m else torch.zeros((n, 8)).byte()
+    distance = (a[:, None].long() - b.long()).square().sum(-1).double()
+    expected = (
+        {
+            (i, j)
+            for i, j in enumerate(distance.argmin(1).tolist())
+            if all(distance[i, j] < 0.8**2 * line.sort().values[1] for line in (distance[i], distance[:, j]))
+        }
+        if min(n, m) > 1
+        else set()
+    )
+    rows, columns = mutual_matches(a, b)
+    assert set(zip(rows.tolist(), columns.tolist(), strict=True)) == expected
+    assert len(expected) > 20 or min(n, m) < 100
 
 
 @pytest.mark.parametrize(("block", "rows"), [(65, [3, 3, 1]), (10, [1] * 7)])

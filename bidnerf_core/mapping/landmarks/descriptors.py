@@ -15,6 +15,10 @@ NORM = 512.0
 """Norm of a quantised descriptor, as usual for SIFT: it makes good use of the range of a byte."""
 MANY = 2**16
 """Number of descriptors converted to floats at a time; converting all those of a large map at once would take gigabytes."""
+RATIO = 0.8
+"""Largest ratio of the distances to the nearest and the second-nearest descriptor of a match (Lowe 2004)."""
+MATCHED_ROWS = 256
+"""Number of descriptors whose distances to all of another image are computed at a time, which fit the processor's cache."""
 BLOCK = 2**20
 """Number of distances to cell centres computed at a time, which bounds the memory."""
 
@@ -72,6 +76,25 @@ def mutual_nearest(distances: Float[Tensor, "n m"]) -> tuple[Int[Tensor, "p"], I
     best, partner = distances.min(1)
     rows = ((distances.argmin(0)[partner] == torch.arange(len(partner))) & best.isfinite()).nonzero()[:, 0]
     return rows, partner[rows]
+
+
+def unambiguous_nearest(a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"]) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
+    """Return the rows of ``a`` whose nearest descriptor in ``b`` is far nearer than the second-nearest, and the rows of the nearest."""
+    if len(b) < 2:
+        return torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.long)
+    others = b.float()
+    blocks = [smallest(squared_distances(part, others), 2) for part in a.split(MATCHED_ROWS)]
+    distances, indices = map(torch.cat, zip(*blocks, strict=True))
+    rows = (distances[:, 0] < RATIO**2 * distances[:, 1]).nonzero()[:, 0]
+    return rows, indices[rows, 0]
+
+
+def mutual_matches(a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"]) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
+    """Return the rows of descriptors that are each other's nearest, and far nearer than the second-nearest of both."""
+    rows, partner = unambiguous_nearest(a, b)
+    numbers, returned = unambiguous_nearest(b[partner], a)
+    is_mutual = returned == rows[numbers]
+    return rows[numbers[is_mutual]], partner[numbers[is_mutual]]
 
 
 def k_means(descriptors: UInt8[Tensor, "n d"], count: int, generator: torch.Generator) -> Float[Tensor, "c d"]:
