@@ -6,9 +6,10 @@ import itertools
 import json
 import math
 import os
+import shutil
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from functools import cache
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +18,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from bidnerf.structure.colmap import LEAST_PHOTOS, ListedPhoto, PhotoSet
-from bidnerf.structure.record import MODEL, TRANSFORMS
+from bidnerf.structure.gps import GeoFrame, align_to_gps
+from bidnerf.structure.joining import join
+from bidnerf.structure.record import MODEL, TRANSFORMS, part_folder
 from bidnerf_core.camera import CentralLens, Intrinsics, Raster, colmap_camera
 from bidnerf_core.captures import up_direction
 from bidnerf_core.datasets import frame_entry
@@ -39,66 +42,69 @@ LEAST_DEPTHS = 30
 
 
 def reconstruct(database: Path, folder: Path, photos: PhotoSet, threads: int, pycolmap: Any) -> list[Any]:
-    """Reconstruct models from the photos in a database, write them to ``folder``, and return them, the largest first.
+    """Reconstruct models from the photos in a database, and return them, the largest first; ``folder`` keeps those of each step.
 
-    Fixed cameras are constant. Photos without overlap form separate models; there may be none. Many photos are placed together, by the
-    global mapper (Pan et al. 2024), which takes a fraction of the time, unless it leaves out many or a focal length is unknown; few ones
-    are placed one after another.
+    Fixed cameras are constant. Many photos are placed together, by the global mapper (Pan et al. 2024), which takes a fraction of the
+    time, unless it leaves out many or a focal length is unknown; few ones are placed one after another. Models that share enough points
+    are joined. Those of photos without overlap stay separate; there may be none.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    options = pycolmap.IncrementalPipelineOptions(
+        num_threads=threads, random_seed=0, extract_colors=False, min_model_size=LEAST_PHOTOS, max_num_models=20
+    )
+    options.constant_cameras = photos.fixed
+    if photos.fixed == photos.cameras.keys():
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
     total, is_known = len(photos.photos), photos.known_focal == photos.cameras.keys()
     models = list[Any]()
     if total >= MANY_PHOTOS and is_known and photos.fixed in (set(), photos.known_focal):
-        models = _placed_together(database, folder, photos, threads, pycolmap)
+        together = partial(_place_together, database, photos, threads, pycolmap)
+        models = _stored(folder / "together", together, pycolmap)
     if not models or models[0].num_reg_images() < ENOUGH_PLACED * total:
-        singly = _placed_singly(database, folder, photos, threads, pycolmap)
+        singly = _stored(folder / "singly", partial(_place_singly, database, total, options, pycolmap), pycolmap)
         models = max(models, singly, key=lambda each: each[0].num_reg_images() if each else 0)
+    if len(models) > 1:
+        apart = models
+        models = _stored(folder / "joined", lambda into: join(apart, database, into, options, pycolmap), pycolmap)
     return models
 
 
-def _placed_together(database: Path, folder: Path, photos: PhotoSet, threads: int, pycolmap: Any) -> list[Any]:
-    """Return the models of the global mapper, which cannot be interrupted."""
+def _stored(folder: Path, write: Callable[[Path], Any], pycolmap: Any) -> list[Any]:
+    """Return the models in a folder, the largest first, without photos that see too little of them; ``write`` makes them if there is none."""
+    if not folder.exists():
+        unfinished = folder.with_suffix(".part")
+        shutil.rmtree(unfinished, ignore_errors=True)
+        unfinished.mkdir(parents=True)
+        write(unfinished)
+        unfinished.rename(folder)
+    models = [pycolmap.Reconstruction(each) for each in sorted(folder.iterdir())]
+    # COLMAP also registers photos by matches that determine no depth, as between photos from one place.
+    for model in models:
+        for number in list(model.reg_image_ids()):
+            if model.image(number).num_points3D < 15:
+                model.deregister_frame(model.image(number).frame_id)
+    good = [model for model in models if model.num_reg_images() >= LEAST_PHOTOS]
+    return sorted(good, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+
+
+def _place_together(database: Path, photos: PhotoSet, threads: int, pycolmap: Any, folder: Path) -> None:
+    """Write the models of the global mapper, which cannot be interrupted, to a folder."""
     count, total = counter("placing photos", "photos"), len(photos.photos)
     count(0, total)
     options = pycolmap.GlobalPipelineOptions(num_threads=threads, random_seed=0, min_model_size=LEAST_PHOTOS)
     if photos.fixed:
         adjustment = options.mapper.bundle_adjustment
         adjustment.refine_focal_length = adjustment.refine_extra_params = False
-    models = _usable_models(pycolmap.global_mapping(database, folder, folder, options))
+    pycolmap.global_mapping(database, folder, folder, options)
     count(total, total)
-    return models
 
 
-def _placed_singly(database: Path, folder: Path, photos: PhotoSet, threads: int, pycolmap: Any) -> list[Any]:
-    """Return the models of the incremental mapper."""
-    options = pycolmap.IncrementalPipelineOptions(
-        num_threads=threads,
-        random_seed=0,
-        extract_colors=False,
-        min_model_size=LEAST_PHOTOS,
-        max_num_models=20,
+def _place_singly(database: Path, total: int, options: Any, pycolmap: Any, folder: Path) -> None:
+    """Write the models of the incremental mapper to a folder."""
+    count, placed = counter("placing photos", "photos"), itertools.count(1)
+    pycolmap.incremental_mapping(
+        database, folder, folder, options, next_image_callback=lambda: count(min(next(placed), total), total)
     )
-    options.constant_cameras = photos.fixed
-    if photos.fixed == photos.cameras.keys():
-        options.ba_refine_focal_length = options.ba_refine_extra_params = False
-        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
-    total, count, placed = len(photos.photos), counter("placing photos", "photos"), itertools.count(1)
-    return _usable_models(
-        pycolmap.incremental_mapping(
-            database, folder, folder, options, next_image_callback=lambda: count(min(next(placed), total), total)
-        )
-    )
-
-
-def _usable_models(models: Mapping[int, Any]) -> list[Any]:
-    """Return the models of enough photos, the largest first, without the photos that see too little of them."""
-    # COLMAP also registers photos by matches that determine no depth, as between photos from one place.
-    for model in models.values():
-        for number in list(model.reg_image_ids()):
-            if model.image(number).num_points3D < 15:
-                model.deregister_frame(model.image(number).frame_id)
-    good = [model for model in models.values() if model.num_reg_images() >= LEAST_PHOTOS]
-    return sorted(good, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
 
 def turn_upright(model: Any, photos: Mapping[int, ListedPhoto], pycolmap: Any) -> None:
@@ -221,16 +227,16 @@ def reasons_left_out(
     ``partners`` counts the photos that overlap with each photo, and ``keypoints`` its keypoints, both by
     photo number.
     """
-    of_model = {number: model for model in reversed(models) for number in model.reg_image_ids()}
+    rank_of = {photo: rank for rank in reversed(range(len(models))) for photo in models[rank].reg_image_ids()}
     reasons = dict(photos.unusable)
     for photo in photos.photos:
-        model, other = of_model.get(photo.number), amount(partners[photo.number], "other photo")
-        if model is models[0]:
+        rank, other = rank_of.get(photo.number), amount(partners[photo.number], "other photo")
+        if rank == 0:
             continue
         reason = f"overlaps with {other}, judging by its {amount(keypoints[photo.number], 'keypoint')}, but too little with the placed ones"
-        if model is not None:
-            size = amount(model.num_reg_images(), "photo")
-            reason = f"belongs to another model, with {size}, that has no connection to the largest"
+        if rank is not None:
+            size, part = amount(models[rank].num_reg_images(), "photo"), part_folder(Path(), rank)
+            reason = f"belongs to another model, with {size}, that has no connection to the largest: {part}"
         reasons[photo.shot.name] = reason
     return reasons
 
@@ -259,17 +265,19 @@ def scale_to_depth(model: Any, photos: Mapping[int, ListedPhoto], pycolmap: Any)
 
 
 def write_dataset(
-    folder: Path,
-    photos: Mapping[int, ListedPhoto],
-    model: Any,
-    base: Path,
-    unit: LengthUnit | Literal["units"],
-    depth_unit: float | None,
-) -> None:
+    folder: Path, photos: Mapping[int, ListedPhoto], model: Any, base: Path, depth_unit: float | None, pycolmap: Any
+) -> tuple[bool, GeoFrame | None]:
     """Write a model of ``photos`` (by number) and its ``transforms.json`` to ``folder``; the model names images relative to ``base``.
 
-    ``depth_unit`` is the length of a step of depth images (metres), if there are any.
+    The model is put in its frame before: in metres by depth or GPS, if there is enough, otherwise upright. ``depth_unit`` is the length
+    of a step of depth images (metres), if there are any. Returns whether the unit is metres, and the model's place by GPS.
     """
+    metric = scale_to_depth(model, photos, pycolmap)
+    geo_frame = None if metric else align_to_gps(model, photos, pycolmap)
+    if geo_frame is None:
+        turn_upright(model, photos, pycolmap)
+    restore_size(model, photos)
+    unit: LengthUnit | Literal["units"] = "metres" if metric or geo_frame else "units"
     entries = []
     for number in sorted(model.reg_image_ids()):
         photo, image = photos[number], model.image(number)
@@ -288,6 +296,7 @@ def write_dataset(
         folder / TRANSFORMS,
         json.dumps({"camera_model": "OPENCV", "unit": unit, "frames": entries}, indent=1, allow_nan=False).encode(),
     )
+    return unit == "metres", geo_frame
 
 
 def from_colmap(camera: Any) -> Intrinsics | CentralLens:

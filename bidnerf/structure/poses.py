@@ -21,7 +21,7 @@ from bidnerf.structure.colmap import (
     write_cameras,
     write_keypoints,
 )
-from bidnerf.structure.gps import align_to_gps, project_positions
+from bidnerf.structure.gps import project_positions
 from bidnerf.structure.matching import candidate_pairs, chosen_pairs, match
 from bidnerf.structure.model import (
     count_contradictions,
@@ -29,9 +29,6 @@ from bidnerf.structure.model import (
     reconstruct,
     relative_path,
     require_parallax,
-    restore_size,
-    scale_to_depth,
-    turn_upright,
     write_dataset,
 )
 from bidnerf.structure.record import (
@@ -43,6 +40,7 @@ from bidnerf.structure.record import (
     interrupted_work,
     is_output,
     open_work,
+    part_folder,
     read_pose_record,
     remove_output,
 )
@@ -75,8 +73,8 @@ def find_poses(
     ``photos`` is a folder of photos, or a video, from which frames are chosen by motion and sharpness and
     written as images, or a recording in a known format that has no poses, whose cameras are kept fixed. ``camera``
     (intrinsics, a file of them, or a source of either) is kept fixed; without it, focal length and
-    radial distortion are estimated, starting from EXIF. If the photos fall into several models, the largest
-    is kept.
+    radial distortion are estimated, starting from EXIF. Models that show the same points are joined. If several
+    remain, the largest is the dataset, and the others are datasets in the folders ``part-2``, ``part-3`` and so on within it.
 
     The dataset is a ``transforms.json`` that refers to the photos in place; ``poses.json`` is the returned record,
     with the photos that were left out and why; ``sparse/0`` is the model in COLMAP's format. The unit of length is
@@ -180,13 +178,12 @@ def _search(
         model, by_number = models[0], {photo.number: photo for photo in photos.photos}
         sure, contradicting = count_contradictions(model, opened, pycolmap)
     error = model.compute_mean_reprojection_error()
-    metric = scale_to_depth(model, by_number, pycolmap)
-    geo_frame = None if metric else align_to_gps(model, by_number, pycolmap)
-    if geo_frame is None:
-        turn_upright(model, by_number, pycolmap)
-    restore_size(model, by_number)
     base: Path = folder / FRAMES if video else source
-    write_dataset(folder, by_number, model, base, "metres" if metric or geo_frame else "units", images.depth_unit)
+    frames = [
+        write_dataset(part_folder(folder, rank), by_number, each, base, images.depth_unit, pycolmap)
+        for rank, each in enumerate(models)
+    ]
+    metric, geo_frame = frames[0]
     reasons = reasons_left_out(photos, models, Counter(itertools.chain(*overlapping)), keypoints)
     left_out = [
         LeftOut(shot.name, relative_path(Path(str(shot.image)), folder), reasons[shot.name])
@@ -208,6 +205,6 @@ def _search(
         sure_pairs=sure,
         contradicting=contradicting,
         turned=sum(by_number[number].exif.orientation != UPRIGHT for number in model.reg_image_ids()),
-        metric=metric or geo_frame is not None,
+        metric=metric,
         geo_frame=geo_frame,
     )

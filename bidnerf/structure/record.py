@@ -19,6 +19,8 @@ from bidnerf_core.errors import InputError, amount
 from bidnerf_core.io import from_plain, read_json, write_file
 
 RECORD, TRANSFORMS, WORK, MODEL, FRAMES = "poses.json", "transforms.json", "work", "sparse/0", "images"
+PART = "part-"
+"""Beginning of the names of the folders with the models that are not joined with the largest; their numbers follow, from 2."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,9 @@ class FoundPoses:
     source: str  # name of the folder of photos, or of the video
     photos: int  # including those that cannot be read
     placed: int  # photos with a pose
-    models: tuple[int, ...]  # number of photos of each model, largest first; only the first is in the dataset
+    models: tuple[
+        int, ...
+    ]  # number of photos of each model, largest first; the others are datasets in part-2, part-3 and so on
     left_out: tuple[LeftOut, ...]
     points: int  # triangulated points of the largest model
     reprojection_error: float  # mean, in pixels of photos downscaled to at most 1600 pixels
@@ -72,7 +76,7 @@ class FoundPoses:
         )
 
     def __str__(self) -> str:
-        several, more = len(self.models) > 1, len(self.left_out) - 5
+        parts, more = [part_folder(Path(), n).name for n in range(1, len(self.models))], len(self.left_out) - 5
         lines = (
             f"poses of {self.placed} of {amount(self.photos, 'photo')}; {amount(self.points, 'point')}, mean error"
             f" {self.reprojection_error:.2f} px{'; in metres, by the measured depth' if self.metric and not self.geo_frame else ''}",
@@ -81,8 +85,8 @@ class FoundPoses:
             if self.geo_frame
             else "",
             f"the photos fall into {len(self.models)} unconnected models of {', '.join(map(str, self.models))} photos;"
-            " the largest is kept"
-            if several
+            f" the largest is the dataset here, the others are datasets of their own in {', '.join(parts)}"
+            if parts
             else "",
             f"{amount(self.turned, 'photo')} turned by EXIF: the dataset has the cameras of the images as stored, while"
             " a photo is localized upright"
@@ -119,6 +123,11 @@ def interrupted_work(folder: Path) -> dict[str, Any]:
     return {}
 
 
+def part_folder(folder: Path, number: int) -> Path:
+    """Return the folder of a model, by its rank from 0: the largest has the pose folder itself, each other one a folder in it."""
+    return folder / f"{PART}{number + 1}" if number else folder
+
+
 def open_work(folder: Path, inputs: str, video: bool) -> Path:
     """Return the work folder, which is emptied unless the work in it has the same inputs.
 
@@ -141,7 +150,10 @@ def is_output(file: Path) -> bool:
     """Return whether a file or folder in a pose folder was written by this module."""
     if file.name == FRAMES:
         return file.is_dir() and all(re.fullmatch(r"\d{6,}\.jpg", each.name) for each in file.iterdir())
-    return file.name in (RECORD, TRANSFORMS, WORK, MODEL.partition("/")[0])
+    sparse = MODEL.partition("/")[0]
+    if re.fullmatch(rf"{PART}\d+", file.name):
+        return file.is_dir() and {each.name for each in file.iterdir()} <= {TRANSFORMS, sparse}
+    return file.name in (RECORD, TRANSFORMS, WORK, sparse)
 
 
 def remove_output(folder: Path) -> None:
@@ -158,5 +170,7 @@ def remove_output(folder: Path) -> None:
         shutil.rmtree(folder / FRAMES)
     (folder / RECORD).unlink(missing_ok=True)
     shutil.rmtree(folder / WORK, ignore_errors=True)
+    for part in filter(is_output, folder.glob(f"{PART}*")):
+        shutil.rmtree(part)
     for name in ("cameras", "frames", "images", "points3D", "rigs"):
         (folder / MODEL / f"{name}.bin").unlink(missing_ok=True)

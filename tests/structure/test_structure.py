@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NoReturn
 
 import av
 import cv2
@@ -134,8 +134,58 @@ def test_the_largest_of_several_models_is_kept_and_every_photo_accounted_for(sea
     assert "keypoint" in reasons["200"]
     assert "not readable as an image" in reasons["202"]
     assert "not readable as an image" in reasons["201"]
-    assert "2 unconnected models of 6, 3 photos" in str(found)
+    assert "2 unconnected models of 6, 3 photos; the largest is the dataset here" in str(found)
     assert json.loads((search.out / "poses.json").read_text())["placed"] == PLACED
+
+
+def test_another_scene_is_a_dataset_of_its_own(search: Search) -> None:
+    assert all(left.reason.endswith("largest: part-2") for left in search.found.left_out[:OTHERS])
+    assert "the others are datasets of their own in part-2" in str(search.found)
+    views = {view.frame.name: view for view in bn.open_dataset(search.out / "part-2").views("all")}
+    assert sorted(views) == ["100", "101", "102"]
+    truth = {f"{100 + number}": pose for number, pose in enumerate(walk(PLACED)[2 : 2 + OTHERS])}
+    metres, degrees = errors(views, truth)
+    assert metres < 0.03
+    assert degrees < 2
+
+
+@pytest.mark.parametrize("shared", [0, 1])
+def test_models_of_two_halves_become_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shared: int) -> None:
+    """The halves have one photo in common, or none but matches. Work that stops before they are joined does not place photos again."""
+    import pycolmap
+
+    poses, placed = walk(9), list[Path]()
+    write_photos(tmp_path / "photos", poses)
+    write_photos(tmp_path / "photos", walk(3), seed=1, first=100)
+
+    def place_parts(database: Path, total: int, options: Any, pycolmap: Any, folder: Path) -> None:
+        placed.append(folder)
+        for part, numbers in enumerate((range(1, 6), range(6 - shared, 10), range(10, 13))):
+            options.image_names = [f"{number:06d}" for number in numbers]
+            (model,) = pycolmap.incremental_mapping(database, folder, tmp_path, options).values()
+            model.transform(pycolmap.Sim3d(1.0 + part, pycolmap.Rotation3d(), np.array([0, 0, part])))
+            (folder / str(part)).mkdir()
+            model.write_binary(folder / str(part))
+
+    def stop(*_: Any) -> NoReturn:
+        raise bn.Cancelled("stopped")
+
+    monkeypatch.setattr("bidnerf.structure.model._place_singly", place_parts)
+    with monkeypatch.context() as stopped:
+        stopped.setattr("bidnerf.structure.model.join", stop)
+        with pytest.raises(bn.Cancelled):
+            bn.find_poses(tmp_path / "photos", tmp_path / "out")
+    found = bn.find_poses(tmp_path / "photos", tmp_path / "out")
+    assert len(placed) == 1
+    assert found.models == (9, 3)
+    views = {view.frame.name: view for view in bn.open_dataset(tmp_path / "out").views("all")}
+    metres, degrees = errors(views, {f"{number:03d}": pose for number, pose in enumerate(poses)})
+    assert metres < 0.01
+    assert degrees < 0.2
+    model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
+    photos = [sorted({element.image_id for element in point.track.elements}) for point in model.points3D.values()]
+    assert sum(seen[0] < 6 - shared and seen[-1] > 5 for seen in photos) > 50
+    assert model.compute_mean_reprojection_error() < 0.5
 
 
 def test_interrupted_work_goes_on(search: Search) -> None:
