@@ -373,13 +373,11 @@ def _triangulate(
         scale, steps = tolerance / 2, 8 if known is None else 0
         points, covariance = refine_points(observations.sightings, points, scale, steps)
         # A point needs at least two keypoints that fit it; if it has only two, both must fit to within 1.5 pixels.
-        sightings = observations.sightings
-        fits = fits_points(sightings, points, tolerance)
-        views = torch.bincount(sightings.point[fits], minlength=len(points))[sightings.point]
-        fits &= (views != 2) | fits_points(sightings, points, min(tolerance, 1.5))
-        observations = observations[
-            fits & (torch.bincount(sightings.point[fits], minlength=len(points)) >= 2)[sightings.point]
-        ]
+        # No name for the sightings, which take much memory and would outlive those that replace them
+        fits, point = fits_points(observations.sightings, points, tolerance), observations.point
+        views = torch.bincount(point[fits], minlength=len(points))[point]
+        fits &= (views != 2) | fits_points(observations.sightings, points, min(tolerance, 1.5))
+        observations = observations[fits & (torch.bincount(point[fits], minlength=len(points)) >= 2)[point]]
     wide = parallax(observations.sightings, points) >= least
     observations, numbers = observations[wide[observations.point]].compact()
     return observations, points[numbers], covariance[numbers]

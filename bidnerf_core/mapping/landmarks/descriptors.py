@@ -48,8 +48,10 @@ def byte_of_zero(descriptors: UInt8[Tensor, "n d"]) -> int:
     """
     if not len(descriptors):
         return 0
-    values = (part.double() for part in descriptors.split(MANY))  # in turn, as all would take gigabytes
-    sums, squares = map(torch.cat, zip(*((part.sum(1), part.square().sum(1)) for part in values), strict=True))
+    # In turn, as all would take gigabytes. Sums of bytes and of their squares are exact up to 2^24.
+    values = (part.float() for part in descriptors.split(MANY))
+    of_parts = ((part.sum(1).double(), part.square_().sum(1).double()) for part in values)
+    sums, squares = map(torch.cat, zip(*of_parts, strict=True))
     if float(sums.var(unbiased=False)) == 0:
         return 0
     slope = ((squares - squares.mean()) * (sums - sums.mean())).mean() / sums.var(unbiased=False)

@@ -387,7 +387,7 @@ def _mean_descriptors(descriptors: UInt8[Tensor, "m d"], point: Int[Tensor, "m"]
     total, lengths = torch.zeros((count, descriptors.shape[1])), torch.zeros((count, 1))
     zero = byte_of_zero(descriptors)
     for rows in torch.arange(len(descriptors)).split(MANY):
-        values = descriptors[rows].float() - zero
+        values = descriptors[rows].float().sub_(zero)
         total.index_add_(0, point[rows], values)
         lengths.index_add_(0, point[rows], torch.linalg.vector_norm(values, dim=-1, keepdim=True))
     number = torch.bincount(point, minlength=count).clamp(min=1)[:, None]
