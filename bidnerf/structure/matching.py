@@ -1,13 +1,13 @@
 """Which photos are matched, and their matches: candidates from what is known, votes of large keypoints, two-view geometry.
 
-Candidates are photos that follow each other, that look alike, and that were taken nearby according to GPS. The largest keypoints of two
-candidates vote for them; photos are matched with the candidates with the most votes, and two-view geometry verifies the matches. Votes
-and matches are tasks of the job's executor, such as a cluster.
+Candidates are photos that follow each other, that look alike, and that were taken nearby according to GPS or roughly known poses. The
+largest keypoints of two candidates vote for them; photos are matched with the candidates with the most votes, and two-view geometry
+verifies the matches. Votes and matches are tasks of the job's executor, such as a cluster.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import combinations, groupby
@@ -19,7 +19,8 @@ from scipy.spatial import cKDTree
 
 from bidnerf.structure.colmap import PhotoSet, import_pycolmap
 from bidnerf_core.devices import map_tasks
-from bidnerf_core.mapping import Vocabulary, mutual_matches
+from bidnerf_core.geometry import SE3
+from bidnerf_core.mapping import Vocabulary, likely_pairs, mutual_matches
 from bidnerf_core.progress import counter
 
 EXHAUSTIVE = 60
@@ -27,7 +28,7 @@ EXHAUSTIVE = 60
 NEIGHBOURS = 10
 """Number of photos before and after each photo, in order of name or time, that are its candidates."""
 SIMILAR_PHOTOS, NEAR_PHOTOS = 60, 20
-"""Number of photos with the most similar descriptors, and of the nearest photos by GPS, that are a photo's candidates."""
+"""Number of photos with the most similar descriptors, and of the nearest photos by GPS or known poses, that are a photo's candidates."""
 VOTING_KEYPOINTS = 500
 """Number of a photo's largest keypoints that vote for its candidates. They stay visible when the distance changes."""
 PARTNERS = 12
@@ -45,11 +46,14 @@ class StoredKeypoints:
     descriptors: np.ndarray  # (n, 128), bytes
 
 
-def candidate_pairs(descriptors: Sequence[np.ndarray], positions: np.ndarray | None = None) -> Pairs:
+def candidate_pairs(
+    descriptors: Sequence[np.ndarray], positions: np.ndarray | None = None, poses: Mapping[int, SE3] | None = None
+) -> Pairs:
     """Return the pairs of photos that may overlap: all of few photos, else neighbours in order, similar photos, and near ones.
 
     The similarity of two photos is the scalar product of their vectors of locally aggregated descriptors (VLAD, Jégou et al. 2010) of
     ``descriptors`` (n, 128), whose words are found in the photos themselves. ``positions`` (n, 3) are in metres, NaN if unknown.
+    Rough ``poses`` (T_world_camera, by number) also tell which photos are near each other and look the same way.
     """
     count = len(descriptors)
     if count <= EXHAUSTIVE:
@@ -65,6 +69,10 @@ def candidate_pairs(descriptors: Sequence[np.ndarray], positions: np.ndarray | N
         near = cKDTree(positions[known]).query(positions[known], min(NEAR_PHOTOS + 1, len(known)))[1]
         for i, others in zip(known.tolist(), known[near].tolist(), strict=True):
             partners[i] = partners[i] + others
+    posed = dict(poses or {})
+    numbers = [*posed]
+    for first, second in likely_pairs([*posed.values()], NEAR_PHOTOS).tolist():
+        partners[numbers[first]].append(numbers[second])
     pairs |= {(min(i, j), max(i, j)) for i, others in partners.items() for j in others if i != j}
     return sorted(pairs)
 

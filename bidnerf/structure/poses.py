@@ -9,6 +9,7 @@ import shutil
 import time
 import warnings
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,7 @@ from bidnerf.structure.sources import (
 from bidnerf_core.camera import UPRIGHT, Camera, CameraSource
 from bidnerf_core.datasets import Capture
 from bidnerf_core.errors import Cancelled, InputError, InputWarning, amount
+from bidnerf_core.geometry import SE3
 from bidnerf_core.io import output_folder, to_plain, write_file
 from bidnerf_core.progress import Cancel, ProgressCallback, job_context, log
 
@@ -67,6 +69,7 @@ def find_poses(
     cancel: Cancel | None = None,
     *,
     reuse: bool = False,
+    known: Mapping[str, SE3] | None = None,
 ) -> FoundPoses:
     """Find the poses of photos by structure from motion with COLMAP (extra ``sfm``), and write them as a dataset.
 
@@ -74,7 +77,8 @@ def find_poses(
     written as images, or a recording in a known format that has no poses, whose cameras are kept fixed. ``camera``
     (intrinsics, a file of them, or a source of either) is kept fixed; without it, focal length and
     radial distortion are estimated, starting from EXIF. Models that show the same points are joined. If several
-    remain, the largest is the dataset, and the others are datasets in the folders ``part-2``, ``part-3`` and so on within it.
+    remain, the largest is the dataset, and the others are datasets in the folders ``part-2``, ``part-3`` and so on within it. ``known``
+    poses (T_world_camera, by name of the photo, of some photos, by any program, in any world) only tell which photos are compared.
 
     The dataset is a ``transforms.json`` that refers to the photos in place; ``poses.json`` is the returned record,
     with the photos that were left out and why; ``sparse/0`` is the model in COLMAP's format. The unit of length is
@@ -112,7 +116,7 @@ def find_poses(
             remove_output(folder)
         work = open_work(folder, inputs, video=not files)
         try:
-            record = _search(source, images, work, inputs, camera, pycolmap)
+            record = _search(source, images, work, inputs, camera, known or {}, pycolmap)
         except Cancelled as stopped:
             raise Cancelled(f"{folder}: {stopped}; the same command resumes from there") from stopped
         except InputError:
@@ -133,6 +137,7 @@ def _search(
     work: Path,
     inputs: str,
     camera: Camera | CameraSource | str | Path | None,
+    known: Mapping[str, SE3],
     pycolmap: Any,
 ) -> FoundPoses:
     """Find the poses of the images of ``source``, or of frames chosen from a recording; write the dataset next to ``work``."""
@@ -158,8 +163,10 @@ def _search(
         numbers = [number for number, count in keypoints.items() if count]
         descriptors = [opened.read_descriptors(number).data for number in numbers]
         positions, _ = project_positions({photo.number: photo for photo in photos.photos}, pycolmap)
-        known = np.array([positions.get(number, np.full(3, np.nan)) for number in numbers])
-        chosen = chosen_pairs(descriptors, candidate_pairs(descriptors, known))
+        places = np.array([positions.get(number, np.full(3, np.nan)) for number in numbers])
+        names = {photo.number: photo.shot.name for photo in photos.photos}
+        posed = {i: known[names[number]] for i, number in enumerate(numbers) if names[number] in known}
+        chosen = chosen_pairs(descriptors, candidate_pairs(descriptors, places, posed))
         match(opened, photos, [(numbers[i], numbers[j]) for i, j in chosen], pycolmap)
     models = reconstruct(database, work / "models", photos, threads, pycolmap)
     with pycolmap.Database.open(database) as opened:

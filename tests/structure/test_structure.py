@@ -490,6 +490,23 @@ def test_photos_that_are_near_by_gps_are_candidates() -> None:
     assert {(0, 200), (0, 399), (200, 399)} <= set(candidate_pairs(seen, positions))
 
 
+def test_photos_whose_known_poses_are_near_and_look_the_same_way_are_candidates() -> None:
+    generator = np.random.default_rng(0)
+    seen = [generator.integers(0, 256, (40, 128)).astype(np.uint8) for _ in range(400)]
+    numbers = range(0, 400, 5)
+    away = {n: float(generator.uniform(0, 100)) for n in numbers}  # along a street, most photos look to its left
+    sides = {n: 1.0 if n < 300 else -1.0 for n in numbers}
+    poses = {n: look_at((away[n], 0.0, 0.0), (away[n], 5.0 * sides[n], 0.0)) for n in numbers}
+    without = set(candidate_pairs(seen))
+    found = set(candidate_pairs(seen, None, poses)) - without
+    assert all(i in poses and j in poses for i, j in found)
+    for number in (0, 150, 350):
+        same = [n for n in numbers if sides[n] == sides[number] and n != number]
+        nearest = sorted(same, key=lambda n, number=number: abs(away[n] - away[number]))[:5]
+        assert {(min(number, n), max(number, n)) for n in nearest} <= found | without
+    assert np.mean([abs(away[i] - away[j]) for i, j in found]) < 25
+
+
 @pytest.mark.parametrize(("latitude", "crs"), [(48.1, "EPSG:32632"), (-33.9, "EPSG:32732")])
 def test_gps_places_a_model_that_it_does_not_bend(tmp_path: Path, latitude: float, crs: str) -> None:
     pycolmap = pytest.importorskip("pycolmap")
