@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from PIL import Image
 from PIL.ExifTags import GPS, IFD
 
 from bidnerf.structure.colmap import ListedPhoto
+from bidnerf_core.errors import InputError
+from bidnerf_core.geometry import fit_most
 
-GPS_OUTLIER = 10.0
-"""Largest distance (metres) between a position by GPS and that of the camera in the model. Most receivers are within five metres."""
 LEAST_POSITIONS = 8
 """Smallest number of positions that agree with a model, and by which it is aligned."""
 SPREAD = 5.0
@@ -72,17 +73,17 @@ def align_to_gps(model: Any, photos: Mapping[int, ListedPhoto], pycolmap: Any) -
     if len(positions) < LEAST_POSITIONS:
         return None
     origin = np.floor(np.median([*positions.values()], axis=0))
-    given = np.array([*positions.values()]) - origin
-    options = pycolmap.RANSACOptions(max_error=GPS_OUTLIER, random_seed=0)
-    names = [model.image(number).name for number in positions]
-    similarity = pycolmap.align_reconstruction_to_locations(model, names, given, LEAST_POSITIONS, options)
-    if similarity is None:
+    given = torch.from_numpy(np.array([*positions.values()]) - origin)
+    centres = torch.tensor(np.array([model.image(number).projection_center() for number in positions]))
+    try:
+        similarity, away, agree = fit_most(centres, given)
+    except InputError:  # no similarity fits
         return None
-    centres = np.array([model.image(number).projection_center() for number in positions])
-    away = np.linalg.norm(np.array([similarity * centre for centre in centres]) - given, axis=1)
-    extent = np.linalg.svd(given[away < GPS_OUTLIER] - given[away < GPS_OUTLIER].mean(0), compute_uv=False)[1]
-    if extent / math.sqrt(len(given)) < SPREAD * np.median(away):  # a straight path leaves a rotation open
+    extent = torch.linalg.svdvals(given[agree] - given[agree].mean(0))[1] / math.sqrt(len(given))
+    if agree.sum() < LEAST_POSITIONS or extent < SPREAD * away.median():  # a straight path leaves a rotation open
         return None
-    model.transform(similarity)
+    T = similarity.T_target_source
+    turn = pycolmap.Rotation3d(T.rotation.numpy())
+    model.transform(pycolmap.Sim3d(similarity.scale, turn, T.translation.numpy()))
     east, north, up = map(float, origin)
-    return GeoFrame(crs, (east, north, up), round(float(np.median(away)), 3), len(positions))
+    return GeoFrame(crs, (east, north, up), round(float(away.median()), 3), len(positions))

@@ -21,7 +21,7 @@ from bidnerf_core.datasets.colmap_files import ModelImage, read_model
 from bidnerf_core.depth import nearest_depth
 from bidnerf_core.errors import InputError, enumeration, errors_in
 from bidnerf_core.frames import View
-from bidnerf_core.geometry import SE3, fit_similarity, spread
+from bidnerf_core.geometry import SE3, fit_most, spread
 from bidnerf_core.settings import Above, Settings, WholeNumbers
 
 
@@ -76,15 +76,10 @@ class SparsePoints:
                 expected=f"at least 2 to determine its unit; it has {self._some}",
             )
         there, here = (torch.stack([pair[i].double().cpu() for pair in known]) for i in (0, 1))
-        fits = torch.ones(len(known), dtype=torch.bool)
         with errors_in(f"{folder}: the unit cannot be estimated from the training cameras"):
-            for _ in range(2):
-                # The second fit leaves out cameras whose error exceeds three times the median, unless it is tiny.
-                used, fit = fits, fit_similarity(there[fits], here[fits])
-                errors = torch.linalg.vector_norm(fit.apply(there) - here, dim=-1)
-                fits = errors <= max(3 * float(errors.median()), 0.01 * spread(here))
-            self.metres, self.cameras = fit.scale, int(used.sum())
-            self.misfit = float(errors[used].median()) / spread(here[used])
+            fit, errors, used = fit_most(there, here)
+        self.metres, self.cameras = fit.scale, int(used.sum())
+        self.misfit = float(errors[used].median()) / spread(here[used])
         # A larger misfit indicates a different scene; a hand-held camera that moved by decimetres reaches 0.03.
         if self.misfit > 0.2:
             raise InputError(

@@ -20,6 +20,7 @@ from .similarity import CovarianceConvention as CovarianceConvention
 from .similarity import LengthUnit as LengthUnit
 from .similarity import Similarity as Similarity
 from .similarity import covariance_in as covariance_in
+from .similarity import fit_most as fit_most
 from .similarity import fit_similarity as fit_similarity
 from .similarity import look_at as look_at
 from .similarity import rigid_pose as rigid_pose

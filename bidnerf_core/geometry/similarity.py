@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal, cast, get_args
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
@@ -121,9 +121,10 @@ class Similarity:
         return SE3(self.T_target_source.rotation @ T_source_camera.rotation, self.apply(T_source_camera.translation))
 
 
-def fit_similarity(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Similarity:
-    """Return the similarity that maps ``source`` to ``target`` in the least-squares sense (Umeyama 1991, eqs.
-    34 to 43).
+def fit_similarity(
+    source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"], weights: Float[Tensor, "n"] | None = None
+) -> Similarity:
+    """Return the similarity that maps ``source`` to ``target`` in the (weighted) least-squares sense (Umeyama 1991, eqs. 34 to 43).
 
     If the points are collinear, the rotation about their line is arbitrary, but the scale is still
     determined. Raises ``InputError`` if all points of either set coincide, or if no similarity fits.
@@ -134,16 +135,37 @@ def fit_similarity(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -
         raise InputError(f"a point is {largest:g} away from the origin", expected=f"at most {FARTHEST_CAMERA:g}")
     if len(source) < 2 or spread(source) == 0 or spread(target) == 0:
         raise InputError(f"{len(source)} pairs of points", expected="2 or more distinct ones")
-    from_mean, to_mean = source - source.mean(0), target - target.mean(0)
-    u, values, vh = torch.linalg.svd(to_mean.mT @ from_mean / len(source))  # eqs. 38, 39
+    share = torch.full((len(source), 1), 1 / len(source)) if weights is None else (weights / weights.sum())[:, None]
+    source_mean, target_mean = (share * source).sum(0), (share * target).sum(0)
+    from_mean, to_mean = source - source_mean, target - target_mean
+    u, values, vh = torch.linalg.svd(to_mean.mT @ (share * from_mean))  # eqs. 38, 39
     sign = torch.ones_like(values)
     sign[2] = torch.sign(torch.linalg.det(u) * torch.linalg.det(vh))  # eq. 43: no reflection
     rotation = (u * sign) @ vh  # eq. 40
-    scale = float((values * sign).sum() / from_mean.square().sum(-1).mean())  # eq. 42
+    scale = float((values * sign).sum() / (share * from_mean.square()).sum())  # eq. 42
     if not scale > 0:
         raise InputError(f"{len(source)} pairs of points, but no similarity maps one set to the other even roughly")
-    translation = target.mean(0) - scale * rotation @ source.mean(0)  # eq. 41
+    translation = target_mean - scale * rotation @ source_mean  # eq. 41
     return Similarity(scale, SE3(rotation, translation))
+
+
+def fit_most(
+    source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]
+) -> tuple[Similarity, Float[Tensor, "n"], Bool[Tensor, "n"]]:
+    """Return the similarity that maps most points of ``source`` to ``target``, all distances after it, and which pairs it fits.
+
+    The sum of the distances is minimized by iteratively reweighted least squares (Weiszfeld 1937), and distances below a hundredth of the
+    spread count as their squares (Huber 1964). Pairs fit whose distance is at most three times the median, or below that hundredth.
+    Raises ``InputError`` as ``fit_similarity`` does.
+    """
+    source, target = source.double(), target.double()
+    weights = torch.ones(len(source), dtype=torch.float64)
+    for _ in range(30):
+        fit = fit_similarity(source, target, weights)
+        distances = torch.linalg.vector_norm(fit.apply(source) - target, dim=-1)
+        small = 0.01 * fit.scale * spread(source)
+        weights = 1 / distances.clamp(min=small)
+    return fit, distances, distances <= max(3 * float(distances.median()), small)
 
 
 def spread(points: Float[Tensor, "n 3"]) -> float:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidnerf_core.geometry import SE3, Similarity, fit_similarity, spread
+from bidnerf_core.geometry import SE3, Similarity, fit_most, fit_similarity, spread
 from refusals import refused
 
 GENERATOR = torch.Generator().manual_seed(0)
@@ -45,6 +45,21 @@ def test_the_rotation_is_scipys_and_the_scale_the_least_squares_one() -> None:
     torch.testing.assert_close(found.T_target_source.rotation, torch.from_numpy(rotation.as_matrix()))
     turned = found.T_target_source.rotate(a)
     assert found.scale == pytest.approx(float((turned * b).sum() / (a * a).sum()))  # d/ds |b - s R a|^2 = 0
+
+
+@pytest.mark.parametrize(("count", "wrong"), [(2, 0), (12, 4), (80, 30)])
+def test_wrong_pairs_leave_the_similarity_of_most_as_it_is(count: int, wrong: int, generator: torch.Generator) -> None:
+    source = torch.rand(count, 3, generator=generator, dtype=torch.float64)
+    target = TRUTH.apply(source) + 0.002 * torch.randn(count, 3, generator=generator)
+    target[:wrong] += 10 * torch.randn(wrong, 3, generator=generator)
+    fit, distances, fits = fit_most(source, target)
+    assert fits.tolist() == [False] * wrong + [True] * (count - wrong)
+    torch.testing.assert_close(distances, torch.linalg.vector_norm(fit.apply(source) - target, dim=-1))
+    if wrong:
+        assert fit.scale == pytest.approx(TRUTH.scale, rel=0.03)
+        assert fit_similarity(source, target).scale != pytest.approx(TRUTH.scale, rel=0.2)
+    alone = fit_similarity(source[fits], target[fits])
+    assert fit_similarity(source, target, fits.double()).scale == pytest.approx(alone.scale)
 
 
 def test_points_that_tell_nothing_are_refused() -> None:
