@@ -201,7 +201,7 @@ def main() -> None:
             for part in {"cluster", "killed"} & rows.keys():
                 rows[part]["equal"] = (base / part / "transforms.json").read_bytes() == whole
             if {"cluster", "killed"} <= rows.keys():
-                rows["killed"]["times_as_long"] = rows["killed"]["wall_seconds"] / rows["cluster"]["wall_seconds"]
+                rows["killed"]["times_as_long"] = rows["killed"]["cpu_seconds"] / rows["cluster"]["cpu_seconds"]
             results[name] = rows
     record(options.name, results)
 

@@ -29,6 +29,7 @@ from bidnerf_core.camera import (
 from bidnerf_core.datasets import Capture, Shot
 from bidnerf_core.devices import map_tasks
 from bidnerf_core.errors import InputError, amount
+from bidnerf_core.geometry import Similarity
 from bidnerf_core.installation import import_extra
 from bidnerf_core.io import read_compact_image, read_header
 from bidnerf_core.mapping import Keypoints, Sift
@@ -138,6 +139,12 @@ def to_colmap(camera: Camera, number: int, pycolmap: Any) -> Any:
     """
     model, parameters = colmap_model(camera)
     return pycolmap.Camera(camera_id=number, model=model, width=camera.width, height=camera.height, params=parameters)
+
+
+def to_sim3d(similarity: Similarity, pycolmap: Any) -> Any:
+    """Convert a similarity to one of pycolmap."""
+    T = similarity.T_target_source
+    return pycolmap.Sim3d(similarity.scale, pycolmap.Rotation3d(T.rotation.numpy()), T.translation.numpy())
 
 
 def write_cameras(database: Any, photos: PhotoSet, pycolmap: Any) -> None:

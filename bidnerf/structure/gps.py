@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 from PIL.ExifTags import GPS, IFD
 
-from bidnerf.structure.colmap import ListedPhoto
+from bidnerf.structure.colmap import ListedPhoto, to_sim3d
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import fit_most
 
@@ -82,8 +82,6 @@ def align_to_gps(model: Any, photos: Mapping[int, ListedPhoto], pycolmap: Any) -
     extent = torch.linalg.svdvals(given[agree] - given[agree].mean(0))[1] / math.sqrt(len(given))
     if agree.sum() < LEAST_POSITIONS or extent < SPREAD * away.median():  # a straight path leaves a rotation open
         return None
-    T = similarity.T_target_source
-    turn = pycolmap.Rotation3d(T.rotation.numpy())
-    model.transform(pycolmap.Sim3d(similarity.scale, turn, T.translation.numpy()))
+    model.transform(to_sim3d(similarity, pycolmap))
     east, north, up = map(float, origin)
     return GeoFrame(crs, (east, north, up), round(float(away.median()), 3), len(positions))

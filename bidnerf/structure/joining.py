@@ -7,7 +7,11 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+import torch
 
+from bidnerf.structure.colmap import to_sim3d
+from bidnerf_core.errors import InputError
+from bidnerf_core.geometry import fit_most
 from bidnerf_core.progress import log
 
 LEAST_SHARED = 30
@@ -72,12 +76,14 @@ def _align(model: Any, other: Any, pairs: np.ndarray, pycolmap: Any) -> tuple[An
     points = [model.point3D(number) for number in pairs[:, 0]]
     target, source = np.array([p.xyz for p in points]), np.array([other.point3D(n).xyz for n in pairs[:, 1]])
     centres = [model.image(point.track.elements[0].image_id).projection_center() for point in points]
-    tolerance = SHARED_DISTANCE * float(np.median(np.linalg.norm(target - centres, axis=1)))
-    sampling = pycolmap.RANSACOptions(max_error=tolerance, random_seed=0)
-    fit = pycolmap.estimate_sim3d_robust(source, target, sampling)
-    if fit is None or fit["num_inliers"] < max(LEAST_SHARED, len(pairs) / 2):
+    try:
+        similarity, away, _ = fit_most(torch.from_numpy(source), torch.from_numpy(target))
+    except InputError:  # no similarity fits
         return None
-    return fit["tgt_from_src"], dict(pairs[fit["inlier_mask"], ::-1].tolist())
+    near = away.numpy() <= SHARED_DISTANCE * np.median(np.linalg.norm(target - centres, axis=1))
+    if near.sum() < max(LEAST_SHARED, len(pairs) / 2):
+        return None
+    return to_sim3d(similarity, pycolmap), dict(pairs[near, ::-1].tolist())
 
 
 def _points_by_keypoint(model: Any) -> dict[int, np.ndarray]:
