@@ -88,10 +88,11 @@ def _align(model: Any, other: Any, pairs: np.ndarray, pycolmap: Any) -> tuple[An
 
 def _points_by_keypoint(model: Any) -> dict[int, np.ndarray]:
     """Return, by number of the photo, the number of the point that each keypoint shows, or -1."""
-    images = {number: model.image(number) for number in model.reg_image_ids()}
     return {
-        number: np.array([p.point3D_id if p.has_point3D() else -1 for p in image.points2D], dtype=np.int64)
-        for number, image in images.items()
+        number: np.array(
+            [p.point3D_id if p.has_point3D() else -1 for p in model.image(number).points2D], dtype=np.int64
+        )
+        for number in model.reg_image_ids()
     }
 
 

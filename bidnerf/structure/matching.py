@@ -15,7 +15,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from bidnerf.structure.colmap import PhotoSet, import_pycolmap
 from bidnerf_core.devices import map_tasks
@@ -46,14 +45,12 @@ class StoredKeypoints:
     descriptors: np.ndarray  # (n, 128), bytes
 
 
-def candidate_pairs(
-    descriptors: Sequence[np.ndarray], positions: np.ndarray | None = None, poses: Mapping[int, SE3] | None = None
-) -> Pairs:
+def candidate_pairs(descriptors: Sequence[np.ndarray], *known: Mapping[int, SE3]) -> Pairs:
     """Return the pairs of photos that may overlap: all of few photos, else neighbours in order, similar photos, and near ones.
 
     The similarity of two photos is the scalar product of their vectors of locally aggregated descriptors (VLAD, Jégou et al. 2010) of
-    ``descriptors`` (n, 128), whose words are found in the photos themselves. ``positions`` (n, 3) are in metres, NaN if unknown.
-    Rough ``poses`` (T_world_camera, by number) also tell which photos are near each other and look the same way.
+    ``descriptors`` (n, 128), whose words are found in the photos themselves. Photos are near if rough poses (T_world_camera, by number)
+    are, and look the same way; each of the ``known`` sources has a world of its own.
     """
     count = len(descriptors)
     if count <= EXHAUSTIVE:
@@ -62,18 +59,12 @@ def candidate_pairs(
     tensors = [torch.from_numpy(own.copy()) for own in descriptors]
     vocabulary = Vocabulary.of(tensors)
     vectors = torch.stack([vocabulary.pool(own) for own in tensors])
-    alike = [(vectors @ vector).topk(min(SIMILAR_PHOTOS + 1, count)).indices.tolist() for vector in vectors]
-    partners = dict(enumerate(alike))
-    known = np.zeros(0, int) if positions is None else np.flatnonzero(np.isfinite(positions).all(1))
-    if positions is not None and len(known) > 1:
-        near = cKDTree(positions[known]).query(positions[known], min(NEAR_PHOTOS + 1, len(known)))[1]
-        for i, others in zip(known.tolist(), known[near].tolist(), strict=True):
-            partners[i] = partners[i] + others
-    posed = dict(poses or {})
-    numbers = [*posed]
-    for first, second in likely_pairs([*posed.values()], NEAR_PHOTOS).tolist():
-        partners[numbers[first]].append(numbers[second])
-    pairs |= {(min(i, j), max(i, j)) for i, others in partners.items() for j in others if i != j}
+    partners = [(vectors @ vector).topk(min(SIMILAR_PHOTOS + 1, count)).indices.tolist() for vector in vectors]
+    for poses in known:
+        numbers = list(poses)
+        for first, second in likely_pairs(list(poses.values()), NEAR_PHOTOS).tolist():
+            partners[numbers[first]].append(numbers[second])
+    pairs |= {(min(i, j), max(i, j)) for i, others in enumerate(partners) for j in others if i != j}
     return sorted(pairs)
 
 

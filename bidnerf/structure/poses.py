@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from bidnerf.structure.colmap import (
@@ -162,11 +161,12 @@ def _search(
         keypoints = {photo.number: opened.num_keypoints_for_image(photo.number) for photo in photos.photos}
         numbers = [number for number, count in keypoints.items() if count]
         descriptors = [opened.read_descriptors(number).data for number in numbers]
-        positions, _ = project_positions({photo.number: photo for photo in photos.photos}, pycolmap)
-        places = np.array([positions.get(number, np.full(3, np.nan)) for number in numbers])
-        names = {photo.number: photo.shot.name for photo in photos.photos}
-        posed = {i: known[names[number]] for i, number in enumerate(numbers) if names[number] in known}
-        chosen = chosen_pairs(descriptors, candidate_pairs(descriptors, places, posed))
+        by_number = {photo.number: photo for photo in photos.photos}
+        positions, _ = project_positions(by_number, pycolmap)
+        by_gps = {number: SE3(torch.eye(3).double(), torch.from_numpy(place)) for number, place in positions.items()}
+        given = {number: known[photo.shot.name] for number, photo in by_number.items() if photo.shot.name in known}
+        near = [{i: poses[n] for i, n in enumerate(numbers) if n in poses} for poses in (by_gps, given)]
+        chosen = chosen_pairs(descriptors, candidate_pairs(descriptors, *near))
         match(opened, photos, [(numbers[i], numbers[j]) for i, j in chosen], pycolmap)
     models = reconstruct(database, work / "models", photos, threads, pycolmap)
     with pycolmap.Database.open(database) as opened:
@@ -182,7 +182,7 @@ def _search(
                 expected="photos that overlap by two thirds, taken while moving sideways",
             )
         require_parallax(models[0], opened, photos, source, pycolmap)
-        model, by_number = models[0], {photo.number: photo for photo in photos.photos}
+        model = models[0]
         sure, contradicting = count_contradictions(model, opened, pycolmap)
     error = model.compute_mean_reprojection_error()
     base: Path = folder / FRAMES if video else source

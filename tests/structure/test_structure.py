@@ -484,8 +484,8 @@ def test_many_photos_are_matched_with_those_whose_keypoints_vote_for_each_other(
 def test_photos_that_are_near_by_gps_are_candidates() -> None:
     generator = np.random.default_rng(0)
     seen = [generator.integers(0, 256, (40, 128)).astype(np.uint8) for _ in range(400)]
-    positions = np.full((400, 3), np.nan)
-    positions[[0, 200, 399]] = [[0, 0, 0], [1, 0, 0], [0, 2, 0]]
+    places = {0: [0.0, 0.0, 0.0], 200: [1.0, 0.0, 0.0], 399: [0.0, 2.0, 0.0]}
+    positions = {number: bn.SE3(torch.eye(3), torch.tensor(place)) for number, place in places.items()}
     assert not {(0, 200), (0, 399), (200, 399)} <= set(candidate_pairs(seen))
     assert {(0, 200), (0, 399), (200, 399)} <= set(candidate_pairs(seen, positions))
 
@@ -498,7 +498,7 @@ def test_photos_whose_known_poses_are_near_and_look_the_same_way_are_candidates(
     sides = {n: 1.0 if n < 300 else -1.0 for n in numbers}
     poses = {n: look_at((away[n], 0.0, 0.0), (away[n], 5.0 * sides[n], 0.0)) for n in numbers}
     without = set(candidate_pairs(seen))
-    found = set(candidate_pairs(seen, None, poses)) - without
+    found = set(candidate_pairs(seen, poses)) - without
     assert all(i in poses and j in poses for i, j in found)
     for number in (0, 150, 350):
         same = [n for n in numbers if sides[n] == sides[number] and n != number]
