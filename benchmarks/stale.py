@@ -48,6 +48,7 @@ MEASURED: Mapping[str, Sequence[str]] = {
     "scans": (*LOCALIZATION, "plugins/bidnerf-scan"),
     "service": ("bidnerf/service",),
     "viewer": ("bidnerf/viewer",),
+    "photos_without_poses": (*IMAGES, "bidnerf_core/mapping", "bidnerf/structure"),
     "photos_": (*LOCALIZATION, "bidnerf/structure"),
     "gpu": (*TRAINING, "bidnerf_core/devices.py"),
     "": LOCALIZATION,
