@@ -154,9 +154,9 @@ def fit_most(
 ) -> tuple[Similarity, Float[Tensor, "n"], Bool[Tensor, "n"]]:
     """Return the similarity that maps most points of ``source`` to ``target``, all distances after it, and which pairs it fits.
 
-    The sum of the distances is minimized by iteratively reweighted least squares (Weiszfeld 1937), and distances below a hundredth of the
-    spread count as their squares (Huber 1964). Pairs fit whose distance is at most three times the median, or below that hundredth.
-    Raises ``InputError`` as ``fit_similarity`` does.
+    The sum of the distances is minimized by iteratively reweighted least squares (Weiszfeld 1937), where distances below a hundredth of
+    the spread count as their squares (Huber 1964). Pairs fit whose distance is then at most three times the median, or below that
+    hundredth; the result is their least-squares similarity. Raises ``InputError`` as ``fit_similarity`` does.
     """
     source, target = source.double(), target.double()
     weights = torch.ones(len(source), dtype=torch.float64)
@@ -165,7 +165,9 @@ def fit_most(
         distances = torch.linalg.vector_norm(fit.apply(source) - target, dim=-1)
         small = 0.01 * fit.scale * spread(source)
         weights = 1 / distances.clamp(min=small)
-    return fit, distances, distances <= max(3 * float(distances.median()), small)
+    fits = distances <= max(3 * float(distances.median()), small)
+    fit = fit_similarity(source, target, fits.double())
+    return fit, torch.linalg.vector_norm(fit.apply(source) - target, dim=-1), fits
 
 
 def spread(points: Float[Tensor, "n 3"]) -> float:
