@@ -22,7 +22,6 @@ from bidnerf.cli.options import (
     SeenImages,
     existing,
     require_device,
-    require_inputs,
     require_map,
     wrong_usage,
 )
@@ -32,6 +31,7 @@ from bidnerf.cli.running import display_progress, interruptible_work
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.installation import import_extra
+from bidnerf_core.io import require_existing
 from bidnerf_core.settings import EXPERT, LARGEST_SEED, WholeNumbers
 
 if TYPE_CHECKING:
@@ -213,7 +213,7 @@ def run_compare(
             expected="the folders of one or more maps, then that of a dataset",
         )
     *maps, data = folders
-    require_inputs(data, expected="the folder of a dataset, after those of the maps")
+    require_existing(data, expected="the folder of a dataset, after those of the maps")
     for map in maps:
         require_map(map)
     if out is not None:
@@ -239,7 +239,7 @@ def run_report(
     results: Annotated[
         tuple[Path, ...],
         Option("RESULTS...", "files written by 'bidnerf evaluate'", positional=True),
-        Check(lambda files: require_inputs(*files, expected="lines as written by 'bidnerf evaluate'")),
+        Check(lambda files: require_existing(*files, expected="lines as written by 'bidnerf evaluate'")),
     ],
     out: Annotated[Path, Option("DIR", "folder for index.html and the figures as PNG and SVG")] = Path("report"),
     criterion: Annotated[

@@ -11,18 +11,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from bidnerf.cli.options import (
+    NEW_POSES,
+    POSES,
     MethodGroup,
     Queries,
     QueryImages,
     RunOptions,
     Seed,
     StartFile,
-    pose_file_help,
     refuse,
     require_device,
     require_map,
     require_one,
-    require_pose_file,
     require_some,
     wrong_usage,
 )
@@ -88,7 +88,7 @@ class StartOptions:
 class AnswerOutput(RunOptions):
     """Where answers are computed, and where they are written."""
 
-    out: Annotated[Path | None, Option("POSES", pose_file_help), Check(require_pose_file)] = None
+    out: Annotated[Path | None, POSES, NEW_POSES] = None
     draw: Annotated[Path | None, Option("DIR", "draw each photo next to the map rendered from the pose found")] = None
 
     def check(self, inputs: Sequence[Path]) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
+from bidnerf import results
 from bidnerf.cli.parameters import FLAG, Check, Group, Option, SettingsGroup, Without
 from bidnerf.cli.parser import as_usage_error
 from bidnerf_core import datasets, mapping
@@ -15,6 +16,7 @@ from bidnerf_core.datasets import TEST_IMAGES as TEST_IMAGES
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.installation import import_extra
+from bidnerf_core.io import require_existing
 from bidnerf_core.registry import USUAL_FEATURES, USUAL_METHOD, Plugins
 from bidnerf_core.settings import EXPERT, LARGEST_SEED, WIDEST_HFOV, Above, OneOf, WholeNumbers
 
@@ -24,22 +26,20 @@ if TYPE_CHECKING:
     from bidnerf_core.io import Background
 
 
-def require_inputs(*paths: Path | str | None, expected: str = "the name of one that exists") -> None:
-    """Raise ``InputError`` if a file or a folder does not exist; scenes in memory, such as demo:blobs, need none."""
-    for path in paths:
-        if path is not None and not str(path).startswith("demo:") and not Path(path).exists():
-            raise InputError("no such file or folder", where=path, expected=expected)
-
-
 def existing(expected: str) -> Check:
-    """Return the check that a path exists; the error says what was ``expected``."""
-    return Check(lambda path: require_inputs(path, expected=expected))
+    """Return the check that a path exists, or is a scene in memory, such as demo:blobs; the error says what was ``expected``."""
+
+    def check(path: Path | str) -> None:
+        if not str(path).startswith("demo:"):
+            require_existing(path, expected=expected)
+
+    return Check(check)
 
 
 def require_some(paths: Sequence[Path]) -> None:
     """Raise ``InputError`` if none of the paths exists; a single one that is missing does not stop the others."""
     if not any(path.exists() for path in paths):
-        require_inputs(*paths)
+        require_existing(*paths)
 
 
 def require_map(folder: Path | str) -> None:
@@ -50,24 +50,8 @@ def require_map(folder: Path | str) -> None:
         read_description(Path(folder))
 
 
-def require_image_files(images: DatasetOptions) -> None:
-    """Raise ``InputError`` if a file or a folder that the options name does not exist."""
-    for file in (images.camera, images.register_depth):
-        if isinstance(file, str | Path) and Path(file).suffix:  # others are names, such as freiburg1
-            require_inputs(file, expected="a file with the intrinsics")
-    for folder in (images.images, images.masks):
-        require_inputs(folder if isinstance(folder, str | Path) else None)
-
-
-def require_pose_file(path: Path) -> None:
-    """Raise ``InputError`` unless poses can be written to a file of this name."""
-    from bidnerf.results import check_pose_file
-
-    check_pose_file(path)
-
-
 ImageOptions: TypeAlias = Annotated[
-    DatasetOptions, Group("images", "How the images and their depth are read."), Check(require_image_files)
+    DatasetOptions, Group("images", "How the images and their depth are read."), Check(DatasetOptions.require_files)
 ]
 MappedImages: TypeAlias = Annotated[ImageOptions, Without("background")]  # in the map, which has a background
 SeenImages: TypeAlias = Annotated[MappedImages, Without("largest")]  # localized at the size that the method chooses
@@ -90,6 +74,15 @@ Seed: TypeAlias = Annotated[int, WholeNumbers(0, LARGEST_SEED), Option("N", "see
 Json: TypeAlias = Annotated[bool, FLAG, Option(None, "print JSON, one value per line")]
 First: TypeAlias = Annotated[int | None, WholeNumbers(1), Option("N", "use only the first N images", "all")]
 NoDepth: TypeAlias = Annotated[bool, FLAG, EXPERT, Option(None, "leave out measured depth")]
+POSES = Option(
+    "POSES",
+    lambda: (
+        "write the poses to this file, in the format of its ending:"
+        f" {', '.join(installed('writers').table)}; .json has all details"
+    ),
+)
+NEW_POSES = Check(lambda path: results.check_pose_file(path))
+"""Checks that poses can be written to a file of this name."""
 StartFile: TypeAlias = Annotated[Path | None, existing("a pose file")]
 Names: TypeAlias = tuple[str, ...]
 FrameNames: TypeAlias = Annotated[Names, Option("NAME...", "use only these frames of the dataset", "all of the split")]
@@ -116,12 +109,6 @@ PointChoice: TypeAlias = Annotated[
 def installed(group: str) -> OneOf:
     """Return the names of the plugins of a group as the values of an option; nothing is imported."""
     return OneOf(Plugins(group, lambda _: iter(())))
-
-
-def pose_file_help() -> str:
-    """Return the help text of an option that names a pose file."""
-    names = ", ".join(installed("writers").table)
-    return f"write the poses to this file, in the format of its ending: {names}; .json has all details"
 
 
 MethodName: TypeAlias = Annotated[

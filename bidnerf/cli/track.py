@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from bidnerf.cli.options import (
+    NEW_POSES,
+    POSES,
     CameraOptions,
     First,
     MapFolder,
@@ -17,13 +19,11 @@ from bidnerf.cli.options import (
     RunOptions,
     StartFile,
     existing,
-    pose_file_help,
     require_device,
-    require_pose_file,
     wrong_usage,
 )
 from bidnerf.cli.output import check_output, print_json, print_table, say
-from bidnerf.cli.parameters import Check, Group, Option, SettingsGroup
+from bidnerf.cli.parameters import Group, Option, SettingsGroup
 from bidnerf.cli.running import display_progress
 from bidnerf.cli.signals import defer_interruptions
 from bidnerf_core import maps
@@ -80,7 +80,7 @@ def run_track(
         Option("SEQUENCE", "folder of a dataset or images, or a video", positional=True),
         existing("a dataset, images or a video"),
     ],
-    out: Annotated[Path, Option("POSES", pose_file_help), Check(require_pose_file)],
+    out: Annotated[Path, POSES, NEW_POSES],
     plot: Annotated[Path | None, Option("PNG", "draw the path over the map's surface, coloured by uncertainty")] = None,
     *,
     run: RunOptions,

@@ -34,7 +34,7 @@ from bidnerf_core.datasets import (
     warn_about,
 )
 from bidnerf_core.errors import InputError
-from bidnerf_core.io import looks_like_image, open_binary, read_header, read_image
+from bidnerf_core.io import looks_like_image, open_binary, read_header, read_image, require_existing
 from bidnerf_core.progress import counter
 from bidnerf_core.training import sharpness
 
@@ -58,8 +58,7 @@ def photos_of(
     the pixels of the frames of a video are meaningful, not their cameras. Raises ``InputError`` if there is no such folder, if
     there are no photos, and if poses are known.
     """
-    if not source.exists():
-        raise InputError("no such file or folder", where=source, expected="photos or a video")
+    require_existing(source, expected="photos or a video")
     if is_video(source):
         video = Video(source)
         pictures = [VideoPicture(video, number, is_upright=True) for number in range(len(video))]

@@ -16,6 +16,7 @@ from bidnerf_core.camera.files import read_camera
 from bidnerf_core.camera.intrinsics import Intrinsics, cameras_at_size, reduced_size, same_aspect
 from bidnerf_core.camera.lenses import Camera, Lens
 from bidnerf_core.errors import InputError, errors_in
+from bidnerf_core.io import require_existing
 
 CameraKind = TypeVar("CameraKind", Intrinsics, Lens, Camera)
 WAYS = "`camera` (a file), `focal` (pixels) or `hfov` (degrees)"
@@ -163,8 +164,7 @@ def folder_camera(
     in ``folder``, or the ``published`` camera of the format. Raises ``InputError`` if there is none, with the reason
     ``unknown`` and the ``ways`` to give one, unless the camera is not needed, and for a given file that does not exist.
     """
-    if isinstance(given, Path) and not given.exists():
-        raise InputError("no such file", where=given, expected=f"the camera of {folder}: {ways}")
+    require_existing(given if isinstance(given, Path) else None, expected=f"the camera of {folder}: {ways}")
     beside = next((file for name in ("camera.json", "cameras.txt") if (file := folder / name).is_file()), None)
     camera = given or beside or published
     if camera is None and is_needed:

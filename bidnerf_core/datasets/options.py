@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias, Union
 
 from bidnerf_core.errors import InputError, UsageError
+from bidnerf_core.io import require_existing
 from bidnerf_core.settings import EXPERT, FARTHEST, WholeNumbers
 
 if TYPE_CHECKING:
@@ -94,6 +95,14 @@ class DatasetOptions:
 
         return read_capture(self, path, readers, in_time_order=True)
 
+    def require_files(self) -> None:
+        """Raise ``InputError`` if a file or a folder that the options name does not exist."""
+        for file in (self.camera, self.register_depth):
+            if isinstance(file, str | Path) and Path(file).suffix:  # others are names, such as freiburg1
+                require_existing(file, expected="a file with the intrinsics")
+        for folder, expected in ((self.images, "the folder of the images"), (self.masks, "a folder of masks")):
+            require_existing(folder if isinstance(folder, str | Path) else None, expected=expected)
+
     @property
     def camera_source(self) -> CameraSource:
         """The camera options as a ``CameraSource`` for single images."""
@@ -128,7 +137,7 @@ class DatasetOptions:
         """The folder of the images, if it is given. Raises ``InputError`` unless it is a folder."""
         if self.images is None or (folder := Path(self.images)).is_dir():
             return None if self.images is None else folder
-        raise InputError("no such folder", where=folder, expected="the folder of the images")
+        raise InputError("is a file", where=folder, expected="the folder of the images")
 
     @property
     def registration(self) -> DepthRegistration | None:

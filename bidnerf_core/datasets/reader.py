@@ -16,7 +16,7 @@ from bidnerf_core.datasets.options import DepthRegistration
 from bidnerf_core.depth import DepthCamera as DepthCamera  # for authors of readers
 from bidnerf_core.errors import InputError, InputWarning, amount, enumeration
 from bidnerf_core.frames import MaskFolder, photos_in
-from bidnerf_core.io import IMAGE_SUFFIXES, is_file, looks_like_image
+from bidnerf_core.io import IMAGE_SUFFIXES, is_file, looks_like_image, require_existing
 from bidnerf_core.io import Background as Background  # for authors of readers
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
 
@@ -49,11 +49,8 @@ def read_capture(
     Raises ``InputError`` for options that the format does not accept, and if a third-party reader fails.
     """
     path, or_else = Path(path), ""
-    if not path.exists():
-        what, expected = (
-            ("file or folder", "a dataset, images or a video") if in_time_order else ("folder", "a dataset")
-        )
-        raise InputError(f"no such {what}", where=path, expected=expected)
+    require_existing(path, expected="a dataset, images or a video" if in_time_order else "a dataset")
+    options.require_files()
     reader = find_reader(path, readers)
     if reader is None and in_time_order:
         # The readers of photos and videos are not registered: they find no poses.

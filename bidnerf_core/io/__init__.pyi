@@ -15,6 +15,7 @@ from .files import output_folder as output_folder
 from .files import read_file as read_file
 from .files import read_open_file as read_open_file
 from .files import reason as reason
+from .files import require_existing as require_existing
 from .files import take_lock as take_lock
 from .files import usable_cores as usable_cores
 from .files import write_file as write_file

@@ -43,6 +43,13 @@ class PackedFile:
         return self.where
 
 
+def require_existing(*paths: Path | str | None, expected: str = "the name of one that exists") -> None:
+    """Raise ``InputError`` if a file or a folder does not exist; ``expected`` says what it should be. None is left out."""
+    for path in paths:
+        if path is not None and not os.path.exists(path):
+            raise InputError("no such file or folder", where=path, expected=expected)
+
+
 def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
     """Open a regular file for reading. ``expected`` briefly describes what the file should be ("an image file").
 

@@ -15,7 +15,7 @@ from bidnerf_core.datasets import Capture
 from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.geometry import SE3, Similarity
-from bidnerf_core.io import open_binary
+from bidnerf_core.io import open_binary, require_existing
 from bidnerf_core.mapping import Keypoints
 from bidnerf_core.registry import Plugins, interface_defects
 
@@ -111,8 +111,7 @@ def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
     Raises ``InputError`` if there is no such file, if the file is unreadable or a Git LFS pointer, and if no
     importer or more than one recognizes it.
     """
-    if not path.exists():
-        raise InputError("no such file or folder", where=path, expected="a trained field or a COLMAP model")
+    require_existing(path, expected="a trained field or a COLMAP model")
     if name is not None:
         return name, IMPORTERS.load(name)
     if path.is_file():

@@ -229,7 +229,7 @@ def test_a_folder_of_images_is_named_where_several_fit(tmp_path: Path) -> None:
     with refused(where=folder / "images/r_0.png", found="no such image"):
         read_all(folder)
     assert len(read_all(folder, images=folder / "colour/right")) == COUNT
-    with refused(where=tmp_path / "none", found="no such folder", expected="the folder of the images"):
+    with refused(where=tmp_path / "none", found="no such file or folder", expected="the folder of the images"):
         open_dataset(folder, images=tmp_path / "none")
     (tmp_path / "scannet").mkdir()
     with refused(found="has its images where its format says"):

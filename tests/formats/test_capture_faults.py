@@ -319,7 +319,7 @@ def test_a_folder_that_is_no_dataset(tmp_path: Path) -> None:
     for name in ("notes/notes.txt", "notes.txt"):
         (tmp_path / name).touch()
     for name, read, found, expected in (
-        ("none", read_all, "no such folder", "a dataset"),
+        ("none", read_all, "no such file or folder", "a dataset"),
         ("none", open_sequence, "no such file or folder", "a dataset, images or a video"),
         (f"sound/{JSON}", read_all, f"is a file of a dataset; give its folder, {folder}", None),
         ("scan.zip", read_all, "is an archive", "the folder of a dataset; unpack the archive first"),

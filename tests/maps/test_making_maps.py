@@ -288,7 +288,7 @@ def test_a_rendering_is_scored_against_the_photo(scene: bn.Map) -> None:
         ({"data": []}, None, "data holds no views", None),
         ({"data": 3}, None, "data is or holds a int", "a dataset, a path, or views"),
         ({"data": [None]}, None, "data is or holds a NoneType", "a dataset, a path, or views"),
-        ({"data": "/nowhere"}, "/nowhere", "no such folder", None),
+        ({"data": "/nowhere"}, "/nowhere", "no such file or folder", None),
         ({"backend": "hashgird"}, None, "no backend 'hashgird'", None),
         ({"config": {"stepps": 3}}, None, "no field 'stepps', did you mean 'steps'?", None),
         ({"config": 7}, None, "config is a int", "a HashGridConfig or a dict"),
