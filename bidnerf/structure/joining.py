@@ -114,14 +114,15 @@ def _merge(model: Any, other: Any, similarity: Any, same: dict[int, int], pycolm
         if not model.exists_camera(image.camera_id):
             model.add_camera(other.camera(image.camera_id))
             model.add_rig(other.rig(frame.rig_id))
-        added = pycolmap.Frame(frame_id=frame.frame_id, rig_id=frame.rig_id)
-        added.add_data_id(image.data_id)
-        added.rig_from_world = frame.rig_from_world
-        model.add_frame(added)
-        pixels = np.array([point.xy for point in image.points2D])
-        copy = pycolmap.Image(name=image.name, keypoints=pixels, camera_id=image.camera_id, image_id=number)
-        copy.frame_id = frame.frame_id
-        model.add_image(copy)
+        if not model.exists_frame(frame.frame_id):
+            added = pycolmap.Frame(frame_id=frame.frame_id, rig_id=frame.rig_id)
+            added.add_data_id(image.data_id)
+            model.add_frame(added)
+            pixels = np.array([point.xy for point in image.points2D])
+            copy = pycolmap.Image(name=image.name, keypoints=pixels, camera_id=image.camera_id, image_id=number)
+            copy.frame_id = frame.frame_id
+            model.add_image(copy)
+        model.frame(frame.frame_id).rig_from_world = frame.rig_from_world
         model.register_frame(frame.frame_id)
     for number, point in other.points3D.items():
         elements = [element for element in point.track.elements if element.image_id in new]

@@ -29,6 +29,7 @@ from bidnerf.results import pose_error
 from bidnerf.structure import FoundPoses
 from bidnerf.structure.colmap import list_photos, to_colmap
 from bidnerf.structure.gps import align_to_gps
+from bidnerf.structure.joining import join
 from bidnerf.structure.matching import NEIGHBOURS, PARTNERS, candidate_pairs, chosen_pairs
 from bidnerf.structure.model import count_contradictions, from_colmap
 from bidnerf.structure.record import digest, open_work, remove_output
@@ -186,6 +187,35 @@ def test_models_of_two_halves_become_one(tmp_path: Path, monkeypatch: pytest.Mon
     photos = [sorted({element.image_id for element in point.track.elements}) for point in model.points3D.values()]
     assert sum(seen[0] < 6 - shared and seen[-1] > 5 for seen in photos) > 50
     assert model.compute_mean_reprojection_error() < 0.5
+
+
+@pytest.mark.parametrize(("wrong", "sizes"), [(False, [10]), (True, [5, 5])])
+def test_models_whose_shared_points_are_scattered_are_not_joined(tmp_path: Path, wrong: bool, sizes: list[int]) -> None:
+    import pycolmap
+
+    options, generator = pycolmap.SyntheticDatasetOptions(num_frames_per_rig=10), np.random.default_rng(0)
+    options.num_rigs = options.num_cameras_per_rig = 1
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        whole = pycolmap.synthesize_dataset(options, database)
+        first = sorted(whole.reg_image_ids())[:5]
+        for pair, seen in zip(*database.read_two_view_geometries(), strict=True):
+            i, j = pycolmap.pair_id_to_image_pair(pair)
+            if wrong and (i in first) != (j in first):
+                seen.inlier_matches = np.stack([seen.inlier_matches[:, 0], generator.permutation(100)], axis=1)
+                database.delete_two_view_geometry(i, j)
+                database.write_two_view_geometry(i, j, seen)
+    models = [pycolmap.Reconstruction(whole) for _ in range(2)]
+    for part, model in enumerate(models):
+        for number in [n for n in whole.reg_image_ids() if (n in first) == (part == 1)]:
+            model.deregister_frame(model.image(number).frame_id)
+    turn = pycolmap.Rotation3d(np.array([0, 0, 0.5]))
+    models[1].transform(pycolmap.Sim3d(2.0, turn, np.array([1, 0, 0])))
+    (tmp_path / "joined").mkdir()
+    join(models, tmp_path / "database.db", tmp_path / "joined", pycolmap.IncrementalPipelineOptions(), pycolmap)
+    joined = [pycolmap.Reconstruction(folder) for folder in sorted((tmp_path / "joined").iterdir())]
+    assert [model.num_reg_images() for model in joined] == sizes
+    assert [model.num_points3D() for model in joined] == [100] * len(sizes)
+    assert max(model.compute_mean_reprojection_error() for model in joined) < 1e-6
 
 
 def test_interrupted_work_goes_on(search: Search) -> None:
