@@ -378,6 +378,7 @@ def main() -> None:
     given.add_argument("--queries", type=int, default=200, help="photos that are localized in a building")
     given.add_argument("--photos", type=int, default=max(BUILDINGS), help="of the largest building")
     options = given.parse_args()
+    one_thread()
     options.work.mkdir(parents=True, exist_ok=True)
     keypoints, buildings = folder_of_keypoints(CACHE), [count for count in BUILDINGS if count <= options.photos]
     results: dict[str, Any] = {}

@@ -672,12 +672,34 @@ def large_projection(records: Records) -> str:
         return value(last) + each * (1_000_000 - last["photos"])
 
     rows = []
-    for step in STEPS:
+    for step in STEPS[:-1]:  # a trial asks for 24 photos of any number
         minutes = projected(lambda found, step=step: found["steps"][step]["cpu_seconds"]) / 60  # type: ignore[misc]
         rows.append((step, f"{minutes / 60:.1f} h" if minutes >= 60 else f"{minutes:.0f} min"))
     for what, name in (("memory of one process", "most_memory_MB"), ("map on disk", "map_MB")):
         rows.append((what, f"{projected(lambda found, name=name: found[name]) / 1e3:,.0f} GB"))  # type: ignore[misc]
     return _table(("a million photos like these, in one map", f"projected from {title}, one core"), rows, records)
+
+
+@table
+def large_photos(records: Records) -> str:
+    """What it takes to find the poses of photos that have none, by ``find_poses`` and by COLMAP."""
+    ways = {
+        "ours": "`bidnerf poses`",
+        "cluster": "the same, on a cluster of four processes",
+        "killed": "the same, one of them killed",
+        "colmap": "COLMAP, all pairs, incremental mapper",
+    }
+    rows = []
+    for found in records["photos_without_poses"].values():
+        for way, title in ways.items():
+            if (own := found.get(way)) is not None:
+                placed = f"{own['placed']} of {own['photos']}"
+                rest = [f"{number}" for number in own["models"][1:]]
+                error, same = f"{own['error']:.3f} px", {True: "to the bit", False: "no"}.get(own.get("equal"), "")
+                rows.append((title, _seconds(own["cpu_seconds_a_photo"]), placed, ", ".join(rest), error, same))
+    return _table(
+        ("poses by", "CPU time a photo", "placed", "in other models", "error", "equal to one process"), rows, records
+    )
 
 
 @table
