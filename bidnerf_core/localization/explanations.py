@@ -114,25 +114,6 @@ class Explanations:
         """The index of the static explanation that leaves the camera the most freedom."""
         return int((self.deviation[:, :6].sum(-1) - self.deviation[:, 6:12].sum(-1)).argmax())
 
-    def first(self, proposal: Proposal, mode: int, noise: float) -> States:
-        """Return the initial states of the search: one for each distinct camera, and one with the stated camera in motion.
-
-        If the focal length or the principal point changes, the camera is moved along its axis and turned to keep about the same view.
-        """
-        still, moving = ((self.distinct & which).nonzero()[:, 0] for which in (~self.moves, self.moves))
-        row = torch.cat([still, moving[:1]])
-        k, mean, deviation = len(row), self.mean[row], self.deviation[row]
-        z = torch.zeros((k, N), dtype=torch.float64)
-        # A deviation of 0 holds a nuisance at its mean.
-        off = (proposal.camera - mean[:, :6]) / deviation[:, :6].clamp(min=1e-12)
-        z[:, :6] = torch.where(off.abs() <= 3, off, 0)
-        change = (mean + deviation * z)[:, :6] - proposal.camera
-        none = torch.zeros(k, dtype=torch.float64)
-        along = proposal.distance * (1 - change[:, 0].exp())
-        update = torch.stack([none, none, along, -change[:, 2], change[:, 1], none], -1)
-        T = SE3(proposal.T.rotation.expand(k, 3, 3), proposal.T.translation.expand(k, 3)).retract(update)
-        return States(T, z, mean, deviation, self.log_prior[row], none + noise, torch.full_like(row, mode), row)
-
     def about(self, free: States) -> States:
         """Return one state for each explanation of each mode, with the poses of ``free`` (g) and the nuisances at their prior means."""
         k, g = len(self), len(free)

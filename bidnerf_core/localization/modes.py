@@ -10,7 +10,7 @@ import torch
 from bidnerf_core.devices import run_on
 from bidnerf_core.localization.explanations import Explanations, Proposal
 from bidnerf_core.localization.matching import STRONGEST, LandmarkMatcher, Matches, Nearest, Projected, QueryKeypoints
-from bidnerf_core.localization.posterior import graduate, most_probable, refine
+from bidnerf_core.localization.posterior import graduate, most_probable
 from bidnerf_core.localization.propose import LEAST_AGREEING, consensus, inliers
 from bidnerf_core.mapping import LandmarkMap, Landmarks, Sights, States, point_variance
 
@@ -86,12 +86,7 @@ class ModeSearch:
                 matches = projected.matches(within)
                 if len(matches) >= LEAST_AGREEING:
                     modes[g] = mode = replace(mode, matches=matches)
-                if radius == RADII[0]:
-                    points = self.matcher.landmarks.positions[mode.matches.landmark].double()
-                    distance = float(best[g].T.inverse().apply(points).norm(dim=-1).median())
-                    again = Proposal(mode.name, best[g].T[0], best[g].nuisances[0, :6], distance)
-                    best[g] = self._compared(mode, again, float(best[g].noise))
-                best[g] = run_on(self.device, refine, best[g], self._term(mode, best[g]))
+                best[g] = run_on(self.device, most_probable, best[g], self._term(mode, best[g]), self.given)
         return modes, States.cat([replace(state, mode=state.mode + g) for g, state in enumerate(best)])
 
     def _agreeing(self, mode: Mode, proposal: Proposal, searched: bool) -> tuple[Mode, States] | None:
@@ -105,17 +100,7 @@ class ModeSearch:
         if len(matches) < LEAST_AGREEING:
             return None
         mode = replace(mode, matches=matches)
-        return mode, self._compared(mode, proposal, mode.query.threshold / 2)
-
-    def _compared(self, mode: Mode, proposal: Proposal, noise: float) -> States:
-        """Return the most probable state of a mode among the kinds of cameras, each with its own noise, using a subset of the matches."""
-        count = len(mode.matches)
-        # At most a hundred matches are compared, evenly spread.
-        some = torch.linspace(0, count - 1, min(count, 100)).long()
-        states = self.given.first(proposal, 0, noise)
-        term = self._term(replace(mode, matches=mode.matches[some]), states[:1])
-        term = replace(term, share=term.share * (count / len(some)))
-        return run_on(self.device, most_probable, states, term)
+        return mode, run_on(self.device, most_probable, known, self._term(mode, known), self.given)
 
     def _warped(self, mode: Mode, proposal: Proposal, best: States) -> States:
         """Return the fit of a camera that explains any warp of the image if many more matches agree with that fit, else ``best``.
@@ -127,8 +112,8 @@ class ModeSearch:
         agreeing = int(inliers(query, self.matcher.landmarks, found, best).sum())
         if agreeing >= 0.7 * len(found):
             return best
-        states = self.given.first(proposal, 0, query.threshold / 2)
-        state = states[(states.row == self.given.widest).nonzero()[:, 0]]
+        widest, known = self.given.widest, States.known(proposal.T, proposal.camera)
+        state = known.under(self.given.mean[widest], self.given.deviation[widest])
         state = run_on(self.device, graduate, state, self._term(replace(mode, matches=found), best))
         more = int(inliers(query, self.matcher.landmarks, found, state).sum())
         return state if more > 1.3 * agreeing else best

@@ -259,10 +259,10 @@ def _true_nuisances(
     return moved, torch.where(determined[:, None, None], pose, torch.inf)
 
 
-def most_probable(states: States, term: Landmarks) -> States:
-    """Refine the states, each with its own noise, and return the most probable one."""
-    states, _ = descend(states, [term], 4)
-    states, normal = descend(term.with_noise(states), [term], 3)
+def most_probable(state: States, term: Landmarks, given: Explanations) -> States:
+    """Return the state at the minimum of the most probable explanation, by the quadratic model about a free fit."""
+    quadratic = linearize_modes(term.with_noise(state), [term], given, 4)
+    states, normal = quadratic.minimum(given.about(quadratic.here))
     return states[log_evidence(states, normal).argmax()[None]]
 
 
@@ -272,11 +272,6 @@ def graduate(states: States, term: Landmarks) -> States:
         states = replace(states, noise=torch.full_like(states.noise, factor * term.most_noise))
         states, _ = descend(states, [term], 4)
     return states
-
-
-def refine(states: States, term: Landmarks) -> States:
-    """Refine the states, each under its own estimated noise."""
-    return descend(term.with_noise(states), [term], 3)[0]
 
 
 def weigh(states: States, term: Landmarks) -> tuple[States, Landmarks]:
@@ -294,11 +289,12 @@ def fit_modes(best: States, terms: Sequence[CostTerm], given: Explanations, step
     return ModeFits(about, quadratic, states, normal, log_evidence(states, normal), *none)
 
 
-def linearize_modes(best: States, terms: Sequence[CostTerm], given: Explanations) -> Quadratic:
-    """Return the quadratic model of the terms, without priors, about the state of each mode."""
-    # The prior fixes nothing that any explanation frees.
+def linearize_modes(best: States, terms: Sequence[CostTerm], given: Explanations, steps: int = 0) -> Quadratic:
+    """Return the quadratic model of the terms, without priors, about each mode's state after some steps of free descent."""
+    # The prior of the descent fixes nothing that any explanation frees.
     free = best.under(given.deviation.new_zeros(N), given.deviation.amax(0))
-    return Quadratic.of(total(free, terms) - prior(free), free)
+    free, normal = descend(free, terms, steps)
+    return Quadratic.of(normal - prior(free), free)
 
 
 def fit_landmarks(best: States, term: Landmarks, given: Explanations) -> ModeFits:
