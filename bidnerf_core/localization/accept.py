@@ -51,6 +51,9 @@ class Evidence:
     mass: float  # probability that the pose is within the tolerance, and its camera credible
     searched: bool  # whether the pose was found by landmarks, not only confirmed by them
     mirrored: bool | None = None  # true if the mirror image was localized
+    other_view: float | None = (
+        None  # number of other keypoints that match from another pose, relative to those of this one
+    )
     on_surface: float | None = None  # fraction of the measured points on the surface
     colour_inliers: float | None = None  # fraction of the measured points on the surface and with its colour
     # mean robust loss of the rays relative to the usual one of the map's own images; None if no rays were rendered
@@ -116,6 +119,13 @@ LANDMARK_BOUNDS = (
         "only {0:.1f} times as many landmarks match as by chance, expected {1:g} times",
     ),
     Bound("spread", 0.06, True, Outcome.UNDETERMINED, "the landmarks are all in {0:.0%} of the image"),
+    Bound(
+        "other_view",
+        0.3,
+        False,
+        Outcome.AMBIGUOUS,
+        "the image shows two views: other keypoints, {0:.0%} as many, match from another pose",
+    ),
     Bound("other_place", 0.02, False, Outcome.AMBIGUOUS, "another place fits with a probability of {0:.0%}", True),
     Bound(
         "credible",

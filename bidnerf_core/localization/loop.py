@@ -344,6 +344,10 @@ class Loop:
         middle = torch.tensor([0.0, 0.0, distance], dtype=torch.float64)
         places = SE3.stack([found.place(g) for g in range(len(modes))])
         same = same_pose(state.T[0], places, middle) & ~torch.tensor([mode.mirrored for mode in modes])
+        # Two photos in one image are two places that different keypoints show.
+        views = [m for m, near in zip(modes, same.tolist(), strict=True) if m.beside != mode.beside and not near]
+        others_of = [~torch.isin(m.matches.keypoint, mode.matches.keypoint) for m in views]
+        other_view = max((float(some.sum()) / len(mode.matches) for some in others_of), default=None)
         same = (found.states.mode == found.mode) | same[found.states.mode]
         agreeing = int(inliers(query, self.landmarks, mode.by_descriptors, state).sum())
         evidence = Evidence(
@@ -360,6 +364,7 @@ class Loop:
             mass=found.mass(distance, self.landmarks.pose_covariance, given.credible[row]),
             searched=searched,
             mirrored=mode.mirrored or None,
+            other_view=other_view,
             **others,
         )
         # Many landmarks are visible, and hardly more match than by chance.

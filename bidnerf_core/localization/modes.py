@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from bidnerf_core.devices import run_on
+from bidnerf_core.localization.accept import LANDMARK_BOUNDS
 from bidnerf_core.localization.explanations import Explanations, Proposal
 from bidnerf_core.localization.matching import STRONGEST, LandmarkMatcher, Matches, Nearest, Projected, QueryKeypoints
 from bidnerf_core.localization.posterior import graduate, most_probable
@@ -27,6 +28,7 @@ class Mode:
     by_descriptors: Matches  # found by descriptors alone
     matches: Matches
     mirrored: bool = False  # whether ``query`` is the mirror image
+    beside: bool = False  # whether it explains keypoints that do not agree with the first place, as in a collage
 
 
 def term_of(modes: Sequence[Mode], best: States, landmarks: LandmarkMap, device: torch.device) -> Landmarks:
@@ -122,8 +124,9 @@ class ModeSearch:
         """Yield the hypotheses that compete with the place of the state ``best``.
 
         A scene may be repetitive, such as two rooms with the same furniture: keypoints that agree with the state may agree as well with
-        similar landmarks elsewhere. The image may also be mirrored. No hypotheses are tried unless a first pose, even a wrong one, agrees
-        with at least ``LEAST_AGREEING`` matches of the image as it is.
+        similar landmarks elsewhere. Keypoints that do not agree with the state may agree with another, if the image is made of two
+        photos. The image may also be mirrored. No hypotheses are tried unless a first pose, even a wrong one, agrees with at least
+        ``LEAST_AGREEING`` matches of the image as it is.
         """
         query, landmarks, modes = self.query, self.matcher.landmarks, list[Mode]()
         q, k = nearest.landmark.shape
@@ -134,16 +137,19 @@ class ModeSearch:
         agreeing[matches.keypoint[inliers(query, landmarks, matches, best, RADII[0])]] = True
         others = nearest.others(near)
         others = others[agreeing[others.keypoint]]
-        # Another place has at least three tenths as many inliers as the first.
+        # Another place, or view, has at least three tenths as many inliers as the first.
         if len(others.keypoint.unique()) >= max(LEAST_AGREEING, 0.3 * int(agreeing.sum())):
             modes.append(Mode("another place", query, others, others))
+        rest = nearest.best[~agreeing[nearest.best.keypoint]]
+        if len(rest) >= max(LEAST_AGREEING, 0.3 * (len(nearest.best) - len(rest))):
+            modes.append(Mode("another view", query, rest, rest, beside=True))
         # A pose with fewer than 1e-150 false alarms is unmistakable, so no mirror image is tried.
         if nfa > -150.0 and landmarks.features == "sift" and len(query.images) == 1:
             matches = Nearest.of(query.mirrored, self.matcher, STRONGEST).best
             modes.append(Mode("mirror image", query.mirrored, matches, matches, mirrored=True))
         for mode in modes:
             other = consensus(mode.query, landmarks, mode.by_descriptors, best.nuisances[0, :6], mode.name)
-            if other is not None:
+            if other is not None and (not mode.beside or LANDMARK_BOUNDS[0].keeps(other[1])):
                 yield mode, other[0]
 
     def _term(self, mode: Mode, state: States) -> Landmarks:

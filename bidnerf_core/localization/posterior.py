@@ -260,7 +260,7 @@ def _true_nuisances(
 
 
 def most_probable(state: States, term: Landmarks, given: Explanations) -> States:
-    """Return the state at the minimum of the most probable explanation, by the quadratic model about a free fit."""
+    """Return the most probable state, by the quadratic model about a free fit; the noise is estimated before that fit."""
     quadratic = linearize_modes(term.with_noise(state), [term], given, 4)
     states, normal = quadratic.minimum(given.about(quadratic.here))
     return states[log_evidence(states, normal).argmax()[None]]

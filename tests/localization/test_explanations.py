@@ -13,16 +13,17 @@ from bidnerf import SE3, Frame, Intrinsics, View
 # Inside: the prior of each explanation, of which answers show the most probable one
 from bidnerf_core.localization.explanations import (
     Explanations,
-    Proposal,
     cameras_of_map,
     correction_between,
     explanations,
 )
 from bidnerf_core.localization.matching import QueryKeypoints
+from bidnerf_core.localization.posterior import most_probable
 from bidnerf_core.mapping import (
     NUISANCES,
     Keypoints,
     LandmarkMap,
+    Landmarks,
     Sights,
     States,
     project,
@@ -218,20 +219,28 @@ def test_a_map_whose_images_do_not_determine_a_camera_leaves_it_free() -> None:
     )
 
 
-# First states
+# States under each explanation
 
 
 @pytest.mark.parametrize("stated", [scaled(0.8), centred(part(60, 0, 1))], ids=["focal length", "crop"])
-def test_states_of_another_camera_begin_where_they_see_about_the_same(stated: Intrinsics) -> None:
-    """A longer focal length is farther away, and a shifted principal point looks aside."""
-    found = given(stated, of_map=(PINHOLE,))
-    points = torch.tensor([[0.0, 0.0, 0.0], [0.2, 0.1, 0.0], [-0.2, 0.2, 0.1]], dtype=torch.float64)
-    proposal = Proposal("s", POSES[0], torch.zeros(6, dtype=torch.float64), float(POSES[0].translation.norm()))
-    first = found.first(proposal, 0, 1.0)
-    assert len(first) == len(set(first.row.tolist()))
-    eye, zero = torch.eye(3, dtype=torch.float64).expand(3, 3, 3), torch.zeros((3, 3), dtype=torch.float64)
-    image = project(first, points[None], Sights(zero[:, :2], zero[:, 0], eye, zero)).image
-    assert float(((image - image[:1]) * stated.fx).norm(dim=-1).max()) < 0.02 * stated.fx
+def test_the_camera_that_fits_is_found_from_a_fit_of_the_stated_one(stated: Intrinsics) -> None:
+    """The image is from the map's camera; the fit begins 5 cm away."""
+    found, generator = given(stated, of_map=(PINHOLE,)), torch.Generator().manual_seed(0)
+    (correction,) = cameras_of_map(query(stated), landmarks(PINHOLE))
+    points = torch.rand((1, 80, 3), generator=generator, dtype=torch.float64) - 0.5
+    one, eye = points.new_ones((1, 80)), torch.eye(3, dtype=torch.float64).expand(1, 80, 3, 3)
+    sights = Sights(points[..., :2], 0 * one, eye, 0 * points, single=True)
+    image = project(States.known(POSES[0], correction), points, sights).image
+    image = image + 0.3 / stated.fx * torch.randn(image.shape, generator=generator, dtype=torch.float64)
+    each, area = one[:, 0], float(stated.width * stated.height)
+    term = Landmarks(points, replace(sights, image=image), one, 0 * one, stated.fx * one, each, each, area, 5.0)
+    start = POSES[0].retract(torch.full((6,), 0.03, dtype=torch.float64).index_fill(0, torch.arange(3, 6), 0.01))
+    best = States.known(start, torch.zeros(6, dtype=torch.float64))
+    for _ in range(3):  # the noise is that at the start of each round
+        best = most_probable(best, term, found)
+    assert found.cameras[int(best.row)].startswith("map")
+    assert float((best.T[0].translation - POSES[0].translation).norm()) < 0.02
+    assert float(best.noise) == pytest.approx(0.3, rel=0.3)
 
 
 def test_each_mode_is_compared_under_every_explanation() -> None:

@@ -35,6 +35,7 @@ from conditions import (
     QUICK,
     CountedDetector,
     centred,
+    collage,
     ground_landmarks,
     ground_view,
     ground_views,
@@ -43,6 +44,7 @@ from conditions import (
     point_view,
     points,
     resized,
+    restated,
     scaled,
     shifted,
     twice,
@@ -232,12 +234,6 @@ def noisy(fault: str, depth: bool = False, number: int = 1, *others: int) -> dic
     return {"views": ground_views(fault, (*others, number), depth)}
 
 
-def stated(view: View, factor: float) -> list[View]:
-    """Return a photo whose focal length is ``factor`` times the true one as it is stated."""
-    frame = replace(view.frame, intrinsics=scaled(factor, view.frame.intrinsics), depth=None)
-    return [replace(view, frame=frame)]
-
-
 SHARP = AutoConfig(fused_rays=1024)
 GROUND: dict[str, tuple[Any, Expected]] = {
     "as stated, RGB": (lambda: noisy("none"), Right(metres=0.0075, degrees=0.18)),
@@ -251,11 +247,13 @@ GROUND: dict[str, tuple[Any, Expected]] = {
     "mirrored": (lambda: noisy("mirror"), Outcome.MIRRORED),
     "blurred 1": (lambda: noisy("blur:1", number=2), Right(metres=0.011, degrees=0.32)),
     "another ground": (lambda: {"views": ground_views("none", seed=5)}, REJECTED),
+    "halves of two photos": (lambda: collage(2, slice(None), slice(80, None)), Outcome.AMBIGUOUS),
+    "inlaid photo": (lambda: collage(0, slice(30, 95), slice(40, 128)), Outcome.AMBIGUOUS),
     "rig": (lambda: noisy("none", False, 1, 0), Right(metres=0.0058, degrees=0.12)),
     "depth 5 % too long": (lambda: noisy("depth-scale:1.05", True), Right(metres=0.0077, degrees=0.18)),
     "focal 0.5, not rendered": (
         lambda: {
-            "views": stated(unseen(), 0.5),
+            "views": restated(unseen(), 0.5),
             "config": NOT_RENDERED,
             # Of surer cameras; their keypoints are as correlated as those of the map's images.
             "landmarks": replace(
@@ -265,16 +263,16 @@ GROUND: dict[str, tuple[Any, Expected]] = {
         MAP._replace(metres=0.03, degrees=1.0),
     ),
     "focal 1.02, not rendered": (
-        lambda: {"views": stated(unseen(), 1.02), "config": NOT_RENDERED},
+        lambda: {"views": restated(unseen(), 1.02), "config": NOT_RENDERED},
         Right(None, metres=0.04, degrees=0.6),
     ),
     "focal 1.02, rendered": (
-        lambda: {"views": stated(unseen(), 1.02), "config": SHARP},
+        lambda: {"views": restated(unseen(), 1.02), "config": SHARP},
         MAP._replace(metres=0.02),
     ),
     "another camera 0.97, rendered": (
         lambda: {
-            "views": stated(textured_view(GROUND_POSES[1], camera=scaled(0.97, GROUND_CAMERA)), 1.0),
+            "views": restated(textured_view(GROUND_POSES[1], camera=scaled(0.97, GROUND_CAMERA)), 1.0),
             "config": SHARP,
         },
         Right(metres=0.02),
@@ -321,7 +319,8 @@ def test_each_further_measurement_brings_the_pose_nearer_and_makes_it_more_certa
     assert ("depth" in found.fused) is depth
     assert alone().fused == ()
     before, after = (pose_error(each.T_world_rig, TRUTH).translation for each in (alone(), found))
-    assert after < 1.001 * before  # landmarks alone are off by a tenth of their standard deviation
+    # Landmarks alone are off by a tenth of their standard deviation; a thousandth of it is no difference.
+    assert after < before + 1e-3 * alone().covariance[:3, :3].trace().sqrt()
     assert_covered(found.T_world_rig, TRUTH, found.covariance)
     for axes in (slice(0, 3), slice(3, 6)):  # position, rotation
         assert float(found.covariance[axes, axes].trace()) < float(alone().covariance[axes, axes].trace())

@@ -157,3 +157,17 @@ def ground_views(fault: str, numbers: Iterable[int] = (1,), depth: bool = False,
     """Return images of the ground with a fault of the catalogue."""
     views = [faulty(ground_view(number, seed), fault, 0) for number in numbers]
     return views if depth else [colour_only(view) for view in views]
+
+
+def restated(view: View, factor: float) -> list[View]:
+    """Return a photo whose focal length is ``factor`` times the true one as it is stated."""
+    frame = replace(view.frame, intrinsics=scaled(factor, view.frame.intrinsics), depth=None)
+    return [replace(view, frame=frame)]
+
+
+def collage(number: int, rows: slice, columns: slice) -> dict[str, Any]:
+    """Return a photo of which a part shows another photo instead."""
+    view, other = ground_views("none", (1, number))
+    rgb = view.frame.rgb.clone()
+    rgb[rows, columns] = other.frame.rgb[rows, columns]
+    return {"views": [replace(view, frame=replace(view.frame, rgb=rgb))]}
