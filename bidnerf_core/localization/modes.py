@@ -11,7 +11,7 @@ from bidnerf_core.devices import run_on
 from bidnerf_core.localization.accept import LANDMARK_BOUNDS
 from bidnerf_core.localization.explanations import Explanations, Proposal
 from bidnerf_core.localization.matching import STRONGEST, LandmarkMatcher, Matches, Nearest, Projected, QueryKeypoints
-from bidnerf_core.localization.posterior import graduate, most_probable
+from bidnerf_core.localization.posterior import fit_landmarks, graduate
 from bidnerf_core.localization.propose import LEAST_AGREEING, consensus, inliers
 from bidnerf_core.mapping import LandmarkMap, Landmarks, Sights, States, point_variance
 
@@ -88,7 +88,7 @@ class ModeSearch:
                 matches = projected.matches(within)
                 if len(matches) >= LEAST_AGREEING:
                     modes[g] = mode = replace(mode, matches=matches)
-                best[g] = run_on(self.device, most_probable, best[g], self._term(mode, best[g]), self.given)
+                best[g] = self._fitted(mode, best[g])
         return modes, States.cat([replace(state, mode=state.mode + g) for g, state in enumerate(best)])
 
     def _agreeing(self, mode: Mode, proposal: Proposal, searched: bool) -> tuple[Mode, States] | None:
@@ -102,7 +102,17 @@ class ModeSearch:
         if len(matches) < LEAST_AGREEING:
             return None
         mode = replace(mode, matches=matches)
-        return mode, run_on(self.device, most_probable, known, self._term(mode, known), self.given)
+        return mode, self._fitted(mode, self._free(proposal))
+
+    def _free(self, proposal: Proposal) -> States:
+        """Return the state of a proposal under the explanation that leaves the camera the most freedom."""
+        widest = self.given.widest
+        state = States.known(proposal.T, proposal.camera).under(self.given.mean[widest], self.given.deviation[widest])
+        return replace(state, row=state.row + widest)
+
+    def _fitted(self, mode: Mode, state: States) -> States:
+        """Return the most probable state of a mode, fitted to its matches from a state of any camera."""
+        return run_on(self.device, fit_landmarks, state, self._term(mode, state), self.given).likeliest
 
     def _warped(self, mode: Mode, proposal: Proposal, best: States) -> States:
         """Return the fit of a camera that explains any warp of the image if many more matches agree with that fit, else ``best``.
@@ -114,9 +124,7 @@ class ModeSearch:
         agreeing = int(inliers(query, self.matcher.landmarks, found, best).sum())
         if agreeing >= 0.7 * len(found):
             return best
-        widest, known = self.given.widest, States.known(proposal.T, proposal.camera)
-        state = known.under(self.given.mean[widest], self.given.deviation[widest])
-        state = run_on(self.device, graduate, state, self._term(replace(mode, matches=found), best))
+        state = run_on(self.device, graduate, self._free(proposal), self._term(replace(mode, matches=found), best))
         more = int(inliers(query, self.matcher.landmarks, found, state).sum())
         return state if more > 1.3 * agreeing else best
 

@@ -259,13 +259,6 @@ def _true_nuisances(
     return moved, torch.where(determined[:, None, None], pose, torch.inf)
 
 
-def most_probable(state: States, term: Landmarks, given: Explanations) -> States:
-    """Return the most probable state, by the quadratic model about a free fit; the noise is estimated before that fit."""
-    quadratic = linearize_modes(term.with_noise(state), [term], given, 4)
-    states, normal = quadratic.minimum(given.about(quadratic.here))
-    return states[log_evidence(states, normal).argmax()[None]]
-
-
 def graduate(states: States, term: Landmarks) -> States:
     """Refine the states in several fits, lowering the noise from 16 times the largest noise of matched keypoints to that noise."""
     for factor in (16.0, 8.0, 4.0, 2.0, 1.0):
@@ -289,12 +282,11 @@ def fit_modes(best: States, terms: Sequence[CostTerm], given: Explanations, step
     return ModeFits(about, quadratic, states, normal, log_evidence(states, normal), *none)
 
 
-def linearize_modes(best: States, terms: Sequence[CostTerm], given: Explanations, steps: int = 0) -> Quadratic:
-    """Return the quadratic model of the terms, without priors, about each mode's state after some steps of free descent."""
-    # The prior of the descent fixes nothing that any explanation frees.
+def linearize_modes(best: States, terms: Sequence[CostTerm], given: Explanations) -> Quadratic:
+    """Return the quadratic model of the terms, without priors, about the state of each mode."""
+    # The prior fixes nothing that any explanation frees.
     free = best.under(given.deviation.new_zeros(N), given.deviation.amax(0))
-    free, normal = descend(free, terms, steps)
-    return Quadratic.of(normal - prior(free), free)
+    return Quadratic.of(total(free, terms) - prior(free), free)
 
 
 def fit_landmarks(best: States, term: Landmarks, given: Explanations) -> ModeFits:
