@@ -132,11 +132,7 @@ MEASURES = {
         "ratio of the landmarks that agree to those that would at a wrong pose",
     ),
     "spread": ("spread over the image", ".0%", "share of the image's cells that hold a landmark that agrees"),
-    "other_view": (
-        "keypoints that show another view",
-        ".0%",
-        "match from another pose, relative to those that match from this one",
-    ),
+    "other_view": ("another view", ".0f", "other keypoints of the image that match from another pose"),
     "other_place": ("another place or the mirror image", ".1%", "probability that it explains the image instead"),
     "credible": (
         "camera as stated, or nearly",

@@ -121,10 +121,10 @@ LANDMARK_BOUNDS = (
     Bound("spread", 0.06, True, Outcome.UNDETERMINED, "the landmarks are all in {0:.0%} of the image"),
     Bound(
         "other_view",
-        0.3,
+        0,
         False,
         Outcome.AMBIGUOUS,
-        "the image shows two views: other keypoints, {0:.0%} as many, match from another pose",
+        "the image shows two views: {0:.0f} other keypoints match from another pose",
     ),
     Bound("other_place", 0.02, False, Outcome.AMBIGUOUS, "another place fits with a probability of {0:.0%}", True),
     Bound(

@@ -346,8 +346,7 @@ class Loop:
         same = same_pose(state.T[0], places, middle) & ~torch.tensor([mode.mirrored for mode in modes])
         # Two photos in one image are two places that different keypoints show.
         views = [m for m, near in zip(modes, same.tolist(), strict=True) if m.beside != mode.beside and not near]
-        others_of = [~torch.isin(m.matches.keypoint, mode.matches.keypoint) for m in views]
-        other_view = max((float(some.sum()) / len(mode.matches) for some in others_of), default=None)
+        other_view = max((m.besides(mode.matches) for m in views), default=None)
         same = (found.states.mode == found.mode) | same[found.states.mode]
         agreeing = int(inliers(query, self.landmarks, mode.by_descriptors, state).sum())
         evidence = Evidence(

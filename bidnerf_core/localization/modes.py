@@ -30,6 +30,10 @@ class Mode:
     mirrored: bool = False  # whether ``query`` is the mirror image
     beside: bool = False  # whether it explains keypoints that do not agree with the first place, as in a collage
 
+    def besides(self, others: Matches) -> int:
+        """Return the number of matched keypoints that are not matched in ``others``."""
+        return int((~torch.isin(self.matches.keypoint, others.keypoint)).sum())
+
 
 def term_of(modes: Sequence[Mode], best: States, landmarks: LandmarkMap, device: torch.device) -> Landmarks:
     """Return the reprojection errors of the modes' matches, padded to equal length; ``best`` (g) are the modes' states.
@@ -89,7 +93,12 @@ class ModeSearch:
                 if len(matches) >= LEAST_AGREEING:
                     modes[g] = mode = replace(mode, matches=matches)
                 best[g] = self._fitted(mode, best[g])
-        return modes, States.cat([replace(state, mode=state.mode + g) for g, state in enumerate(best)])
+        # Matches by chance are no other view of the scene.
+        first = modes[0].matches
+        some = [g for g, m in enumerate(modes) if not m.beside or m.besides(first) >= 0.3 * len(first)]
+        return [modes[g] for g in some], States.cat(
+            [replace(best[g], mode=best[g].mode + n) for n, g in enumerate(some)]
+        )
 
     def _agreeing(self, mode: Mode, proposal: Proposal, searched: bool) -> tuple[Mode, States] | None:
         """Return a mode with the matches that agree with a proposal, and its most probable state; None if too few agree."""
@@ -102,7 +111,8 @@ class ModeSearch:
         if len(matches) < LEAST_AGREEING:
             return None
         mode = replace(mode, matches=matches)
-        return mode, self._fitted(mode, self._free(proposal))
+        # With few matches, a model about the free fit is not accurate at the camera that is chosen, so that it is fitted again.
+        return mode, self._fitted(mode, self._fitted(mode, self._free(proposal)))
 
     def _free(self, proposal: Proposal) -> States:
         """Return the state of a proposal under the explanation that leaves the camera the most freedom."""

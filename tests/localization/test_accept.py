@@ -45,7 +45,7 @@ SOUND = Evidence(
     mass=1.0,
     searched=True,
 )
-COUNTS = ("inliers", "mirrored")
+COUNTS = ("inliers", "mirrored", "other_view")
 UNSURE, SURE = LogisticModel({}, -1.0), LogisticModel({}, 8.0)
 LEVELS = {"risk": {"least_confidence": [[0.01, 0.97], [0.05, 0.9], [0.1, 0.8]]}}
 
