@@ -18,6 +18,8 @@ from bidnerf_core.localization.explanations import (
     explanations,
 )
 from bidnerf_core.localization.matching import QueryKeypoints
+
+# Inside: the fit under each explanation, whose noise and camera answers do not show
 from bidnerf_core.localization.posterior import fit_landmarks
 from bidnerf_core.mapping import (
     NUISANCES,
