@@ -182,6 +182,11 @@ WITHOUT_LANDMARKS = {
         ".0%",
         "share that meets the surface well before the point that was measured",
     ),
+    "image_inliers": (
+        "small image that agrees",
+        ".0%",
+        "share of a small image that agrees with the surface's rendering at the best pose",
+    ),
     "runner_up_margin": (
         "lead over the runner-up",
         ".2f",

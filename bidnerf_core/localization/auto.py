@@ -9,25 +9,23 @@ of the map's own images. In a map with neither surface nor landmarks, ``auto`` n
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 import torch
 
 from bidnerf_core.depth import find_depth_sensor
-from bidnerf_core.errors import InputError, enumeration
-from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.accept import Evidence, Support, least_confidence
+from bidnerf_core.errors import InputError
+from bidnerf_core.localization.accept import Evidence, least_confidence
 from bidnerf_core.localization.by_surface import localize_by_depth, localize_by_images
-from bidnerf_core.localization.explanations import CAMERAS
-from bidnerf_core.localization.loop import LandmarkAnswer, Loop
+from bidnerf_core.localization.loop import Loop
 from bidnerf_core.localization.methods import METHODS, Method
 from bidnerf_core.localization.posterior import mass_within
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.localization.result import Localization, Outcome, Verdict, current_record
+from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search import without_pose
 from bidnerf_core.localization.settings import AutoConfig
-from bidnerf_core.mapping import true_intrinsics
 
 
 def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
@@ -40,17 +38,56 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     loop = None
     if problem.matcher is not None and config.landmarks:
         loop = Loop(problem.views, problem.matcher, problem, config.fused_rays, seed)
-    answer = None if loop is None else loop()
-    found = None if answer is None else localization_of(problem, answer, began)
-    # No other measurement can correct a pose by landmarks with these outcomes.
-    if found is None or not (
-        found.converged or found.outcome in (Outcome.MISCALIBRATED, Outcome.MIRRORED, Outcome.AMBIGUOUS)
-    ):
-        found = _on_surface(problem, config, seed, loop, found, began)
-    explained = found.converged or found.outcome is Outcome.UNDETERMINED
+    best: Localization | None = None
+    for found in answers(problem, config, seed, loop):
+        best = found if best is None or is_better(found, best) else best
+        # No other measurement can correct a pose with these outcomes.
+        if best.outcome in (Outcome.CONVERGED, Outcome.MISCALIBRATED, Outcome.MIRRORED, Outcome.AMBIGUOUS):
+            break
+    best = best or unrecognized(problem)
+    explained = best.converged or best.outcome is Outcome.UNDETERMINED
     if problem.matcher is None and problem.surface is not None and not explained:
-        found = replace(found, reason=f"{found.reason}; the map has no landmarks ('bidnerf bake' makes them)")
-    return within_limits(replace(found, seconds=time.perf_counter() - began), config)
+        best = replace(best, reason=f"{best.reason}; the map has no landmarks ('bidnerf bake' makes them)")
+    return within_limits(replace(best, seconds=time.perf_counter() - began), config)
+
+
+def answers(problem: Problem, config: AutoConfig, seed: int, loop: Loop | None) -> Iterator[Localization]:
+    """Yield answers, those that take the least time first: by landmarks and the start, by measured depth, and by images of the surface.
+
+    A map with neither landmarks nor a surface has one answer, by a descent from the start.
+    """
+    surface = problem.surface
+    if loop is not None:
+        began = time.perf_counter()
+        if (answer := loop()) is not None:
+            yield answer.localization(problem, began)
+    elif surface is None:
+        why = "the map has no surface ('bidnerf bake' makes one)"
+        if problem.start is None:
+            raise InputError("method 'auto' then needs a start; give one", where=why)
+        method = METHODS.load("bid", f"{why}, so method 'auto' descends as 'bid' does")
+        descended = method.solve(problem, method.settings(), seed)
+        yield replace(descended, reason=f"{why}; {descended.reason}")
+    # If the map's own images usually have 150 matches, an image without recognised landmarks shows something else.
+    if surface is None or (loop is not None and loop.landmarks.usual_matches >= 150):
+        return
+    config = config if loop is None else replace(config, rounds=1)
+    found = localize_by_depth(problem, surface, config, seed, loop)
+    # Images take longer than points to search; in a map whose own images were all recognised, landmarks suffice.
+    if found is None and (loop is None or loop.landmarks.trial.found < loop.landmarks.trial.images):
+        found = localize_by_images(problem, surface, config, seed, loop)
+    if found is not None:
+        yield found
+
+
+def is_better(found: Localization, best: Localization) -> bool:
+    """Return whether a further answer replaces the best of those before it."""
+    # A landmark-based pose with too few matches is a pose by chance.
+    if best.outcome is Outcome.TOO_FEW_MATCHES:
+        return True
+    # Of five poses that only the surface supported, where landmarks had found an uncertain one, three were wrong (``answers_new``).
+    by_landmarks = isinstance(found.diagnostics, Evidence)
+    return found.converged and (by_landmarks or best.outcome is not Outcome.UNCERTAIN)
 
 
 def localize_by_landmarks(problem: Problem, rays: int, seed: int) -> Localization:
@@ -58,88 +95,7 @@ def localize_by_landmarks(problem: Problem, rays: int, seed: int) -> Localizatio
     assert problem.matcher is not None
     began = time.perf_counter()
     answer = Loop(problem.views, problem.matcher, problem, rays, seed)()
-    return unrecognized(problem) if answer is None else localization_of(problem, answer, began)
-
-
-def _on_surface(
-    problem: Problem, config: AutoConfig, seed: int, loop: Loop | None, best: Localization | None, began: float
-) -> Localization:
-    """Localize on the surface by measured depth or images; failing that, return ``best``, the landmark-based answer so far."""
-    surface = problem.surface
-    if loop is None and surface is None:
-        why = "the map has no surface ('bidnerf bake' makes one)"
-        if problem.start is None:
-            raise InputError("method 'auto' then needs a start; give one", where=why)
-        method = METHODS.load("bid", f"{why}, so method 'auto' descends as 'bid' does")
-        descended = method.solve(problem, method.settings(), seed)
-        return replace(descended, reason=f"{why}; {descended.reason}")
-    # If the map's own images usually have 150 matches, an image without recognised landmarks shows something else.
-    if surface is None or (loop is not None and loop.landmarks.usual_matches >= 150):
-        return best or unrecognized(problem)
-    config = config if loop is None else replace(config, rounds=1)
-    found = localize_by_depth(problem, surface, config, seed)
-    # Images take longer than points to search; in a map whose own images were all recognised, landmarks suffice.
-    if found is None and (loop is None or loop.landmarks.trial.found < loop.landmarks.trial.images):
-        found = localize_by_images(problem, surface, config, seed)
-    if found is None:
-        return best or unrecognized(problem)
-    there = None if loop is None else loop.at(found.T_world_camera)
-    if there is not None and there.verdict.accepted:
-        found = localization_of(problem, there, began)
-        return replace(found, reason=f"found on the surface; {found.reason}")
-    if isinstance(judged := found.diagnostics, Support):
-        # An approximate focal length does not matter to the points of another sensor.
-        by_rays = problem.depth_rays is not None and not any(view.frame.has_depth for view in problem.views)
-        more = {
-            "confirmed": None if there is None else float(not there.contradicted),
-            "known_focal": float(by_rays or not problem.focal_is_approximate),
-        }
-        judged = replace(judged, measures=judged.measures | more)
-        verdict = judged.verdict(found.reason)
-        found = replace(
-            found,
-            outcome=verdict.outcome,
-            reason=verdict.reason,
-            confidence=verdict.confidence,
-            diagnostics=judged,
-        )
-    # A landmark-based pose with too few matches is a pose by chance. Of five poses that only the surface supported, where landmarks had
-    # found an uncertain one, three were wrong (``answers_new``).
-    if best is None or best.outcome is Outcome.TOO_FEW_MATCHES:
-        return found
-    return found if found.converged and best.outcome is not Outcome.UNCERTAIN else best
-
-
-def localization_of(problem: Problem, answer: LandmarkAnswer, began: float) -> Localization:
-    """Convert an answer of the landmark loop to a ``Localization``."""
-    T, noise = answer.T_world_rig, float(answer.posterior.states.noise[answer.posterior.best])
-    stated, camera = problem.views[-1].frame.intrinsics, answer.camera
-    corrected = None if camera is None else true_intrinsics(stated, camera[:6])
-    reason = answer.verdict.reason
-    if answer.fused:
-        reason += f", fused with {enumeration(answer.fused)}"
-    if corrected is not None:
-        reason += f", with {CAMERAS[answer.explanation[0]]}"
-        # A focal length from EXIF, or an assumed one, was not stated to be exact.
-        reason += "" if problem.focal_is_approximate else " instead of the stated one"
-    if answer.explanation[1]:
-        reason += ", with the motion of a rolling shutter"
-    if (record := current_record()) is not None:
-        record.answers.append(answer)
-    path = [T, T] if problem.start is None else [problem.start, T, T]
-    losses = torch.full((len(path) - 1,), noise, dtype=torch.float64)
-    found = Localization.of(
-        replace(answer.verdict, reason=reason),
-        SE3.stack(path),
-        losses,
-        "auto",
-        began,
-        noise,
-        answer.covariance,
-        answer.evidence,
-    )
-    factor = 1.0 if camera is None else float(camera[0].exp())
-    return replace(found, intrinsics=corrected, focal_factor=factor)
+    return unrecognized(problem) if answer is None else answer.localization(problem, began)
 
 
 def unrecognized(problem: Problem) -> Localization:

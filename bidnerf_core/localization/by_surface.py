@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -17,6 +16,7 @@ from bidnerf_core.fields import levels
 from bidnerf_core.frames import Thumbnail, is_blank
 from bidnerf_core.geometry import SE3, random_units
 from bidnerf_core.localization.accept import Support, support
+from bidnerf_core.localization.loop import Loop
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search import (
@@ -48,17 +48,24 @@ POINT_STAGES = (
     (400, 6, 2, 0.05, 0.1),
     (2000, 4, 1, 0.0, 1.0),
 )
-IMAGE_STAGES = ((16, 0, 48), (16, 8, 12), (24, 8, 4), (48, 8, 2), (96, 5, 2))
-"""Stages of the search by images: pixels of the longer side, steps, poses kept."""
+IMAGE_STAGES = (
+    # pixels of the longer side, steps, poses kept, fraction of the pixels that must agree at the best pose, or the search ends
+    (16, 0, 48, 0.6),
+    (16, 8, 12, 0.7),
+    (24, 8, 4, 0.7),
+    (48, 8, 2, 0.7),
+    (96, 5, 2, 0.7),
+)
 
 
 @torch.no_grad()
-def localize_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int) -> Localization | None:
+def localize_by_depth(
+    problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int, loop: Loop | None
+) -> Localization | None:
     """Align measured points with the surface, in rounds until a pose is acceptable, then refine this pose with rendered rays as well.
 
     Returns None if too few points were measured.
     """
-    began = time.perf_counter()
     points = Surface.of(problem.views, problem.depth_rays, surface, seed, config.points)
     if points is None:
         return None
@@ -99,15 +106,19 @@ def localize_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig,
     }
     words = f"{measures['colour_inliers']:.0%} of the measured points match the surface in position and colour"
     loss = float(compared.costs(best).mean())
-    return conclude(problem, SE3.cat([path[:-1], T[None]]), losses, Support(measures), words, began, loss, covariance)
+    path = SE3.cat([path[:-1], T[None]])
+    return conclude(problem, loop, path, losses, Support(measures), words, loss, covariance)
 
 
-def localize_by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int) -> Localization:
+def localize_by_images(
+    problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int, loop: Loop | None
+) -> Localization:
     """Localize by comparing the images with renderings of the surface, in rounds until an answer is accepted.
 
-    Each answer is refined on rays rendered from the field. If no answer is accepted, the one with the smallest loss is returned.
+    Each answer is refined on rays rendered from the field, unless too much of the image disagrees with the surface at all poses. If no
+    answer is accepted, the one with the smallest loss is returned.
     """
-    began, problem, answers = time.perf_counter(), problem.without_depth(), list[Localization]()
+    problem, answers = problem.without_depth(), list[Localization]()
     if all(is_blank(view.frame) for view in problem.views):
         why = Verdict(Outcome.UNDETERMINED, "the image has a single colour, as if the lens were covered")
         return without_pose(problem, why)
@@ -120,8 +131,15 @@ def localize_by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig
         )
         later = [Stage([coarse], min(4, config.fine_steps), 2), Stage([fine], config.fine_steps, 1)]
         found, middle = by_images(problem, surface, config.hypotheses, seed + number, later)
-        answers.append(localization_by_rays(problem, found, fresh, middle, config.converged_inliers, began))
-        if answers[-1].converged:
+        if found.complete:
+            answer = localization_by_rays(problem, loop, found, fresh, middle, config.converged_inliers)
+        else:
+            loss = float(found.scores[0])
+            judged = Support({"image_inliers": 1 - loss / Images.INDEPENDENT})
+            answer = conclude(problem, loop, found.path, found.losses, judged, "", loss, None)
+        answers.append(answer)
+        # Another round does not determine a focal length.
+        if answer.outcome in (Outcome.CONVERGED, Outcome.IMPRECISE):
             break
     return min(answers, key=lambda answer: (not answer.converged, answer.loss))
 
@@ -160,10 +178,11 @@ def by_images(
     background = problem.bounds.background if float(seen.met.float().mean()) < 1 - 0.2 else None
     renderer = surface_renderer(surface, background)
     stages = []
-    for width, steps, keep in IMAGE_STAGES:
+    for width, steps, keep, agreeing in IMAGE_STAGES:
         thumbnails = [move_to(Thumbnail.of(view, width), surface.device) for view in problem.views]
         # Wide scales cope with images exposed twice or half as long as the map's.
-        stages.append(Stage([Images(renderer, thumbnails, gain=1.0, rounds=5)], steps, keep))
+        term, most = Images(renderer, thumbnails, gain=1.0, rounds=5), (1 - agreeing) * Images.INDEPENDENT
+        stages.append(Stage([term], steps, keep, most=most))
     start = states_at(hypotheses(surface, problem.start, middle, count, False, seed))
     return halve(start, [*stages, *later], middle, surface.device), middle
 

@@ -17,11 +17,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from bidnerf_core.devices import run_on
+from bidnerf_core.errors import enumeration
 from bidnerf_core.fields import has_field
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.accept import Evidence, judge, same_pose
-from bidnerf_core.localization.explanations import USUAL, Explanations, Proposal, explanations
+from bidnerf_core.localization.explanations import CAMERAS, USUAL, Explanations, Proposal, explanations
 from bidnerf_core.localization.matching import (
     CELLS,
     STRONGEST,
@@ -54,11 +55,11 @@ from bidnerf_core.localization.propose import (
     proposal_at,
     proposals_at,
 )
-from bidnerf_core.localization.result import Verdict, current_record
+from bidnerf_core.localization.result import Localization, Verdict, current_record
 from bidnerf_core.localization.terms.images import Images, refine_on_small_images
 from bidnerf_core.localization.terms.rays import RenderedRays
 from bidnerf_core.localization.terms.surface import Surface
-from bidnerf_core.mapping import CostTerm, Features, LandmarkMap, Landmarks, States
+from bidnerf_core.mapping import CostTerm, Features, LandmarkMap, Landmarks, States, true_intrinsics
 
 DEPTH_WIDTH = 2.0
 """Ratio of the prior standard deviation of the depth scale to that of the sensor's model, since some sensors are off by far more."""
@@ -100,6 +101,29 @@ class LandmarkAnswer:
     def camera(self) -> Float[Tensor, "6"] | None:
         """The correction of the stated camera, or None if the stated camera is at least approximately right."""
         return None if self.explanation[0] in USUAL[:3] else self.posterior.chosen.nuisances[0, :6]
+
+    def localization(self, problem: Problem, began: float) -> Localization:
+        """Return the pose with its verdict, and put this answer on the active record; ``began`` is as for ``Localization.of``."""
+        T, noise = self.T_world_rig, float(self.posterior.states.noise[self.posterior.best])
+        stated, camera = problem.views[-1].frame.intrinsics, self.camera
+        corrected = None if camera is None else true_intrinsics(stated, camera[:6])
+        reason = self.verdict.reason
+        if self.fused:
+            reason += f", fused with {enumeration(self.fused)}"
+        if corrected is not None:
+            reason += f", with {CAMERAS[self.explanation[0]]}"
+            # A focal length from EXIF, or an assumed one, was not stated to be exact.
+            reason += "" if problem.focal_is_approximate else " instead of the stated one"
+        if self.explanation[1]:
+            reason += ", with the motion of a rolling shutter"
+        if (record := current_record()) is not None:
+            record.answers.append(self)
+        path = [T, T] if problem.start is None else [problem.start, T, T]
+        losses = torch.full((len(path) - 1,), noise, dtype=torch.float64)
+        verdict = replace(self.verdict, reason=reason)
+        found = Localization.of(verdict, SE3.stack(path), losses, "auto", began, noise, self.covariance, self.evidence)
+        factor = 1.0 if camera is None else float(camera[0].exp())
+        return replace(found, intrinsics=corrected, focal_factor=factor)
 
 
 class Loop:

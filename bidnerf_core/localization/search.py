@@ -5,6 +5,7 @@ A search ends with steps on rendered rays: at first few rays at the coarsest lev
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ from bidnerf_core.errors import amount
 from bidnerf_core.fields import RadianceField
 from bidnerf_core.geometry import SE3, Robust
 from bidnerf_core.localization.accept import DISPLACEMENT, Support, same_pose, support
+from bidnerf_core.localization.loop import Loop
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Verdict, current_record
 from bidnerf_core.localization.settings import (
@@ -42,6 +44,7 @@ class Stage:
     steps: int
     keep: int
     score: Callable[[States], Float[Tensor, "h"]] | None = None  # by which poses are compared; None: the cost
+    most: float = math.inf  # score of the best pose above which no pose can be accepted, and the search ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +58,7 @@ class SearchResult:
     before: States  # (1) the best pose before the last stage
     path: SE3  # (s + 1): from the winning hypothesis to the best pose
     losses: Float[Tensor, "s"]  # of the path before each step; costs of different stages are not comparable
+    complete: bool  # whether all stages were run
 
 
 def halve(
@@ -68,7 +72,7 @@ def halve(
     """
     states, middle = move_to(start, device), middle.to(device, torch.float64)
     poses, losses, margin, scores = [states.T[None]], list[Tensor](), float("inf"), states.noise
-    rivals = before = states[:0]
+    rivals, before, complete = states[:0], states[:0], True
     for stage in stages:
         check_cancelled()
         path: list[tuple[SE3, Tensor]] = []
@@ -92,9 +96,12 @@ def halve(
         losses += [cost for _, cost in path]
         poses, losses = [T[:, passing] for T in poses], [values[passing] for values in losses]
         states, scores = states[passing], scores[passing]
+        if float(scores[0]) > stage.most:
+            complete = False
+            break
     path_losses = torch.stack([values[0] for values in losses]) if losses else scores[:0]
     path_poses = SE3.cat([T[:, 0] for T in poses])
-    return move_to(SearchResult(states, scores, margin, rivals, before, path_poses, path_losses), "cpu")
+    return move_to(SearchResult(states, scores, margin, rivals, before, path_poses, path_losses, complete), "cpu")
 
 
 def states_at(T: SE3) -> States:
@@ -134,11 +141,11 @@ def draw_rays(
 
 def localization_by_rays(
     problem: Problem,
+    loop: Loop | None,
     found: SearchResult,
     fresh: RenderedRays,
     middle: Float[Tensor, "3"],
     least_inliers: float,
-    began: float,
 ) -> Localization:
     """Accept or reject the best pose of a search, using rays to which the pose was not fitted.
 
@@ -172,22 +179,36 @@ def localization_by_rays(
     loss = float(normal.cost) * float(rays.noise) ** 2 / rays.independent
     known = (covariance + covariance.mT) / 2 if determined else None
     judged = Support(measures, {"new_inliers": least_inliers})
-    return conclude(problem, path, found.losses, judged, words, began, loss, known)
+    return conclude(problem, loop, path, found.losses, judged, words, loss, known)
 
 
 def conclude(
     problem: Problem,
+    loop: Loop | None,
     path: SE3,
     losses: Float[Tensor, "s"],
-    judged: Support,
+    support: Support,
     accepted: str,
-    began: float,
     loss: float,
     covariance: Float[Tensor, "6 6"] | None,
 ) -> Localization:
-    """Return the answer at the end of a search's ``path``; the path begins at the start, if there is one. ``accepted`` is the reason."""
+    """Return the answer at the end of a search's ``path``: that of the landmarks there if they accept it, else that of its ``support``.
+
+    The path begins at the start, if there is one. ``accepted`` is the reason if the support suffices.
+    """
+    began, there = time.perf_counter(), None if loop is None else loop.at(path[-1])
+    if there is not None and there.verdict.accepted:
+        found = there.localization(problem, began)
+        return replace(found, reason=f"found on the surface; {found.reason}")
+    # An approximate focal length does not matter to the points of another sensor.
+    by_rays = problem.depth_rays is not None and not any(view.frame.has_depth for view in problem.views)
+    more = {
+        "confirmed": None if there is None else float(not there.contradicted),
+        "known_focal": float(by_rays or not problem.focal_is_approximate),
+    }
+    support = replace(support, measures=support.measures | more)
     path = path if problem.start is None else SE3.cat([problem.start[None], path[1:]])
-    return Localization.of(judged.verdict(accepted), path, losses, "auto", began, loss, covariance, judged)
+    return Localization.of(support.verdict(accepted), path, losses, "auto", began, loss, covariance, support)
 
 
 def without_pose(problem: Problem, why: Verdict) -> Localization:

@@ -127,7 +127,7 @@ def test_depth_rays_of_a_wide_lidar_are_matched_without_colour_where_no_image_se
 def test_a_few_depth_rays_are_too_little_to_search_by(monkeypatch: pytest.MonkeyPatch) -> None:
     """The images decide where there are fewer points than a shape needs."""
     by_surface = import_module("bidnerf_core.localization.by_surface")
-    monkeypatch.setattr(by_surface, "IMAGE_STAGES", ((16, 0, 4), (16, 2, 2)))
+    monkeypatch.setattr(by_surface, "IMAGE_STAGES", ((16, 0, 4, 0.0), (16, 2, 2, 0.0)))
     view = baked.unseen()[0]
     few = in_camera(view)[:49]
     problem = rig(FieldMap(baked.FIELD, baked.BOUNDS, baked.toy()), [colour_only(view)], None, few)
