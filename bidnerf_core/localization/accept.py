@@ -246,8 +246,8 @@ SUPPORT_BOUNDS = (
         Outcome.FREE_SPACE_VIOLATED,
         "{0:.0%} of the lines of sight pass through the surface",
     ),
-    # A search ends where more of a small image disagrees with the surface. A pose needs 93 % of the rays to agree; of Mic's and
-    # the rooms' own images, at most 11 % disagree after the first steps, of images of other scenes at least 21 %.
+    # A search by images ends where less of a small image agrees. Of 46 images of six scenes whose poses were accepted, at most 27 %
+    # disagreed in any stage with steps; of 24 images of other scenes, at least 31 % in the last one.
     Bound(
         "image_inliers",
         0.7,
