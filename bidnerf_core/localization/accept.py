@@ -246,8 +246,8 @@ SUPPORT_BOUNDS = (
         Outcome.FREE_SPACE_VIOLATED,
         "{0:.0%} of the lines of sight pass through the surface",
     ),
-    # A search by images ends where less of a small image agrees. Of 46 images of six scenes whose poses were accepted, at most 27 %
-    # disagreed in any stage with steps; of 24 images of other scenes, at least 31 % in the last one.
+    # A search by images ends where less of a small image agrees. Of 45 images of five scenes whose poses were accepted, at most 27 %
+    # disagreed in any stage with steps; of 24 images of other scenes, at least 35 % in the last one.
     Bound(
         "image_inliers",
         0.7,
