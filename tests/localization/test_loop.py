@@ -24,6 +24,8 @@ from bidnerf.testing import GROUND_CAMERA, TexturedGround, textured_map, texture
 from bidnerf.testing import POSES as GROUND_POSES
 from bidnerf_core.fields import FieldValues
 from bidnerf_core.localization import AutoConfig, LandmarkAnswer, LandmarkMatcher, LogisticModel, Loop, rig
+
+# Inside: the answer at a proposal that is given, with the matches it is compared with
 from bidnerf_core.localization.matching import STRONGEST
 from bidnerf_core.localization.propose import proposal_at
 from bidnerf_core.mapping import concatenate
