@@ -18,12 +18,14 @@ sys.path.append(str(Path(__file__).parents[1] / "support"))
 
 import attacks
 import fuzz
+import intruders
 import stops
 from harness import Check
 
 KINDS: dict[str, Callable[[Path, float], Iterable[Check]]] = {
     # Functions of an empty folder and of the scale of the random searches, 1 for whole ones.
     "attacks": lambda work, scale: attacks.checks(work, round(820 * scale)),
+    "intruders": lambda work, scale: intruders.checks(work),
     "large inputs": lambda work, scale: fuzz.large_inputs(work),
     "COLMAP counts": lambda work, scale: fuzz.checks(work, round(150 * scale), only=fuzz.MODEL),
     "tracker states": lambda work, scale: fuzz.checks(work, round(600 * scale), only=fuzz.STATE),
