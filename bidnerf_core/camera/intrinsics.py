@@ -338,7 +338,8 @@ def cameras_at_size(
     """
     size = (width, height)
     if fit == "whole":
-        same = tuple(c.resized(*size) for c in cameras if same_aspect((c.width, c.height), size))
+        resized = {c: c.resized(*size) for c in set(cameras) if same_aspect((c.width, c.height), size)}
+        same = tuple(resized[c] for c in cameras if c in resized)  # most maps have few cameras for all their images
         if same:
             return (same,)
         cameras = tuple(c for c in cameras if same_aspect((c.height, c.width), size))
