@@ -29,6 +29,8 @@ LARGEST_SEED = 2**31 - 1
 WIDEST_HFOV = 170.0
 """Largest horizontal field of view (degrees): beyond it, the inner half of the angles fills less than 1/12 of a pinhole image."""
 
+LARGEST_LENGTH = 1e15
+"""Largest length (metres): squares of larger lengths approach the largest single-precision number."""
 FARTHEST = 1e9
 """Largest depth (metres) that counts as measured: no sensor reaches farther."""
 
@@ -127,6 +129,11 @@ Count = Annotated[int, Range(1, 10**7)]
 Layers = Annotated[int, Range(1, 100)]
 NotNegative = Annotated[float, Range(0.0)]
 Positive = Annotated[float, Above(0.0, 1e6)]
+WholeNumber = Annotated[int, Range(0)]
+Share = Annotated[float, Range(0.0, 1.0)]
+Degrees = Annotated[float, Range(0.0, 180.0)]
+Length = Annotated[float, Range(0.0, LARGEST_LENGTH)]
+Coordinate = Annotated[float, Range(-LARGEST_LENGTH, LARGEST_LENGTH)]
 
 
 class Settings:

@@ -301,7 +301,8 @@ def conversion(hint: Any, notes: Sequence[Any] = ()) -> tuple[int | str | None, 
             return choices[word]
         if optional and word == "None":
             return None
-        for kind in plain:
+        # An empty word, such as that of an unset variable, is no name of a file; Python takes it for the current folder.
+        for kind in plain if word or Path not in plain else ():
             try:
                 value = kind(word)
             except ValueError:

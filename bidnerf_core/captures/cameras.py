@@ -20,11 +20,12 @@ from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3, Similarity, scale_point
 from bidnerf_core.io import read_json, write_file
-from bidnerf_core.settings import Range, Settings
+from bidnerf_core.settings import LARGEST_LENGTH, Coordinate, Range, Settings
 
 MatrixRows = tuple[tuple[float, float, float, float], ...]
 """The rows of a 4x4 matrix."""
-RowMotion = tuple[float, float, float, float, float, float]
+Pixels = Annotated[float, Range(0, 1e6)]
+RowMotion = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]
 """A camera's motion while an image is read out (metres, then radians); see ``rolling_shutter``."""
 INRIA_CAMERAS = "cameras.json"
 """Name of the file in which the original 3D Gaussian splatting code stores the training cameras."""
@@ -38,7 +39,7 @@ class StoredCamera:
     intrinsics: Intrinsics
     T_world_camera: MatrixRows
     given_T_world_camera: MatrixRows | None = None  # the dataset's pose, if training refined it
-    moved_pixels: float | None = None  # median shift (pixels) of the image's points by the refinement
+    moved_pixels: Pixels | None = None  # median shift of the image's points by the refinement
     # camera motion from the first row to the last, if refinement estimated it
     motion: RowMotion | None = None
     file: str | None = None  # image file, relative to the folder of its dataset, if known
@@ -82,10 +83,8 @@ class MovedCamera:
 class PoseRefinement(Settings):
     """How well the given and the adjusted poses fit the keypoints that images share, and which poses training used."""
 
-    noise_before: Annotated[
-        float, Range(0, 1e6)
-    ]  # pixels: standard deviation of reprojection errors at the given poses
-    noise_after: Annotated[float, Range(0, 1e6)]
+    noise_before: Pixels  # standard deviation of reprojection errors at the given poses
+    noise_after: Pixels
     refined: bool = False  # whether training used the adjusted poses
     replaced: tuple[str, ...] = ()  # images with a wrong given pose, localized with the others' landmarks
 
@@ -131,12 +130,14 @@ def record_refinement(
 
 
 def cameras_with_invalid_pose(cameras: Sequence[StoredCamera]) -> list[str]:
-    """Return the names of cameras whose given or refined pose is not a rigid transform."""
+    """Return the names of cameras whose given or refined pose is not a rigid transform, or is too far away."""
     poses = [(c.name, rows) for c in cameras for rows in (c.T_world_camera, c.given_T_world_camera) if rows]
     wrong = {name for name, rows in poses if len(rows) != 4}
     if poses and not wrong:
-        rigid = _pose([rows for _, rows in poses]).is_rigid().tolist()
-        wrong = {name for (name, _), sound in zip(poses, rigid, strict=True) if not sound}
+        matrices = torch.tensor([rows for _, rows in poses], dtype=torch.float64)
+        is_near = (matrices[:, :3, 3].abs() <= LARGEST_LENGTH).all(dim=-1)
+        sound = SE3.from_matrix(matrices).is_rigid() & is_near & (matrices[:, 3] == torch.eye(4)[3]).all(dim=-1)
+        wrong = {name for (name, _), is_sound in zip(poses, sound.tolist(), strict=True) if not is_sound}
     return [camera.name for camera in cameras if camera.name in wrong]
 
 

@@ -6,11 +6,12 @@ The records are plain JSON-serializable data; ``sentences`` puts them into words
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 from bidnerf_core.errors import amount
 from bidnerf_core.geometry import scale_point
 from bidnerf_core.mapping import HeldOutTrial
+from bidnerf_core.settings import Coordinate, Degrees, Length, NotNegative, Range, Share, WholeNumber
 
 PhotoProblem = Literal["mirrored", "turned", "badly posed", "apart", "isolated", "blurred", "badly exposed"]
 """Problems that a photo may have, most serious first. A photo is "apart" if it belongs to a smaller group of
@@ -20,6 +21,10 @@ Arrangement = Literal["around", "inside", "one side", "one place", "unknown"]
 """How the cameras are arranged: around what they look at, inside it, all on one side of it, all at about
 the same position, or unknown."""
 
+Point = tuple[Coordinate, Coordinate, Coordinate]
+Elevation = Annotated[float, Range(-90, 90)]
+Stops = Annotated[float, Range(-1000, 1000)]
+"""The logarithm to base 2 of a ratio of two brightnesses or energies."""
 SUMMARY_LINES = 5
 """Largest number of lines of a summary."""
 ARRANGEMENTS: dict[Arrangement, str] = {
@@ -58,22 +63,21 @@ class PhotoRecord:
     """Information about one photo of a capture."""
 
     name: str
-    position: tuple[float, float, float]  # of the camera, metres, world
-    direction: tuple[float, float, float]  # of the optical axis, unit, world
-    sharpness: float  # log2 of the ratio of fine to coarse energy, relative to nearby photos
-    exposure: (
-        float | None
-    )  # stops: brightness of the same landmarks, relative to the other photos; None if it shows too few
-    overexposed: float  # fraction of the pixels
-    underexposed: float
-    keypoints: int
-    landmarks: int  # number of triangulated landmarks that it shows
-    linked: int  # number of photos with which it shares enough landmarks
+    position: Point  # of the camera, metres, world
+    direction: Point  # of the optical axis, unit, world
+    sharpness: Stops  # ratio of fine to coarse energy, relative to nearby photos
+    # brightness of the same landmarks, relative to the other photos; None if it shows too few
+    exposure: Stops | None
+    overexposed: Share  # of the pixels
+    underexposed: Share
+    keypoints: WholeNumber
+    landmarks: WholeNumber  # number of triangulated landmarks that it shows
+    linked: WholeNumber  # number of photos with which it shares enough landmarks
     group: int  # index of its group of linked photos; 0 for the largest, -1 for none
     # Distance of its given pose from the pose estimated from landmarks; None if there is no estimate.
-    pose_translation: float | None = None  # metres
-    pose_rotation_deg: float | None = None
-    pose_deviations: float | None = None  # in standard deviations of such differences in this capture
+    pose_translation: Length | None = None  # metres
+    pose_rotation_deg: Degrees | None = None
+    pose_deviations: NotNegative | None = None  # in standard deviations of such differences in this capture
     problems: tuple[PhotoProblem, ...] = ()
 
 
@@ -81,7 +85,7 @@ class PhotoRecord:
 class Gap:
     """A range of directions from the centre of the scene in which there is no camera."""
 
-    degrees: float
+    degrees: Annotated[float, Range(0, 360)]
     after: str  # names of the photos on either side
     before: str
 
@@ -95,18 +99,18 @@ class CoverageRecord:
 
     arrangement: Arrangement = "unknown"
     # metres: where the optical axes converge, or the median landmark
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # unit, world: the upward direction of the scene
-    parallax_deg: float = 0.0  # median angle between the rays to a point
-    landmarks: int = 0  # number of triangulated landmarks
-    seen_by: float = 0.0  # median number of photos that show a landmark
-    seen_by_two: float = 0.0  # fraction of the landmarks that only two photos show
-    seen_within_deg: float = 0.0  # median angle between the directions from which a landmark is seen
+    centre: Point = (0.0, 0.0, 0.0)
+    up: Point = (0.0, 0.0, 1.0)  # unit, world: the upward direction of the scene
+    parallax_deg: Degrees = 0.0  # median angle between the rays to a point
+    landmarks: WholeNumber = 0  # number of triangulated landmarks
+    seen_by: NotNegative = 0.0  # median number of photos that show a landmark
+    seen_by_two: Share = 0.0  # of the landmarks: that only two photos show
+    seen_within_deg: Degrees = 0.0  # median angle between the directions from which a landmark is seen
     # widest range of directions without a camera if the cameras do not go all the way around; ``gaps`` are the others
     open_side: Gap | None = None
     gaps: tuple[Gap, ...] = ()  # much wider than the capture's other steps, the widest first
     # elevation of the cameras seen from the centre, or of the axes of cameras inside: 5th and 95th percentiles
-    heights_deg: tuple[float, float] = (0.0, 0.0)
+    heights_deg: tuple[Elevation, Elevation] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -116,7 +120,7 @@ class CaptureReport:
     photos: tuple[PhotoRecord, ...]
     coverage: CoverageRecord
     trial: HeldOutTrial = HeldOutTrial()
-    exposure_range: float = 0.0  # stops between the darkest and the brightest tenth of the photos
+    exposure_range: Stops = 0.0  # between the darkest and the brightest tenth of the photos
 
     def scaled(self, factor: float) -> CaptureReport:
         """Return the report with all lengths multiplied by ``factor``."""

@@ -1,4 +1,3 @@
-from .contract import LARGEST_LENGTH as LARGEST_LENGTH
 from .contract import DifferentiatedField as DifferentiatedField
 from .contract import FieldDerivatives as FieldDerivatives
 from .contract import FieldValues as FieldValues

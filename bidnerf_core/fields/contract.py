@@ -17,6 +17,7 @@ from torch import Generator, Tensor
 from bidnerf_core.devices import TensorRows, constant
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import scale_point
+from bidnerf_core.settings import LARGEST_LENGTH
 
 
 def contract_points(points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
@@ -262,10 +263,6 @@ def _tensors_of(field: object, kind: str) -> Iterator[Tensor]:
     elif is_dataclass(field):
         inner = (getattr(field, part.name) for part in fields(field))
         yield from _tensors_of(next((part for part in inner if isinstance(part, RadianceField)), None), kind)
-
-
-LARGEST_LENGTH = 1e15
-"""Largest length (metres): squares of larger lengths approach the largest single-precision number."""
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bidnerf_core.fields import LARGEST_LENGTH, VoxelGrid
+from bidnerf_core.fields import VoxelGrid
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import COLOUR_ROUNDING, TensorKind, check_tensors, pack_tensors
 from bidnerf_core.mapping.landmarks.descriptors import DescriptorCells
 from bidnerf_core.mapping.landmarks.landmark_map import HeldOutTrial, LandmarkMap, Tracks
 from bidnerf_core.mapping.surface.surface_map import SurfaceMap, Surfels
 from bidnerf_core.mapping.surface.surfel_index import CELLS_OF_BLOCK, COARSER_FROM, SurfelIndex, block_shape
+from bidnerf_core.settings import LARGEST_LENGTH
 
 TINY = sys.float_info.min  # the least number above 0
 SURFELS = ("positions", "normals", "rgb", "rgb_gradient")

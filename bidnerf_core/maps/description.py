@@ -20,12 +20,24 @@ from bidnerf_core.installation import with_writer
 from bidnerf_core.io import from_plain, read_json
 from bidnerf_core.mapping import USUAL_FEATURES
 from bidnerf_core.maps.description_file import DESCRIPTION, VERSION, read_description
-from bidnerf_core.settings import Above, NotNegative, Range, Settings
+from bidnerf_core.settings import (
+    LARGEST_LENGTH,
+    Above,
+    Coordinate,
+    Degrees,
+    Length,
+    NotNegative,
+    Range,
+    Settings,
+    Share,
+    WholeNumber,
+)
 
 PART_NAMES = ("weights", "training", "surface", "landmarks", "capture")
 """The keys of ``map.json`` whose values are file names."""
 ANCHOR = "anchor.json"
 LandmarkSource = Literal["photos", "rendered images"]
+Scale = Annotated[float, Above(0, LARGEST_LENGTH)]
 
 
 @dataclass(frozen=True)
@@ -46,9 +58,9 @@ class Anchor(Settings):
         (0.0, 0.0, 1.0, 0.0),
         (0.0, 0.0, 0.0, 1.0),
     )
-    metres_per_unit: Annotated[float, Above(0)] = 1.0
-    position_sigma: NotNegative = 0.0  # of the anchor itself, along each axis; metres
-    orientation_sigma: NotNegative = 0.0  # about each axis; degrees
+    metres_per_unit: Scale = 1.0
+    position_sigma: Length = 0.0  # of the anchor itself, along each axis; metres
+    orientation_sigma: Degrees = 0.0  # about each axis
 
     def __post_init__(self) -> None:
         """Raise ``InputError`` for a value out of range, or a matrix that is not a rigid transform."""
@@ -68,7 +80,7 @@ class Anchor(Settings):
 class FieldFrame(Settings):
     """The scale and bounds in which a map's field was trained, for a map that was scaled afterwards."""
 
-    scale: Annotated[float, Above(0)]  # units of the map per unit of the field
+    scale: Scale  # units of the map per unit of the field
     bounds: SceneBounds  # of the field, in its own unit
 
 
@@ -79,23 +91,24 @@ class MapInfo:
     backend: str  # of the field; empty if the map has no field, not even an unfinished one
     config: dict[str, Any]
     bounds: SceneBounds
-    step: int  # training steps done; 0 in a map of landmarks alone, which has no field
+    step: WholeNumber  # training steps done; 0 in a map of landmarks alone, which has no field
     complete: bool  # whether training has finished
     data: str = ""  # name of the dataset's folder
-    seconds: float = 0.0  # of training
+    seconds: NotNegative = 0.0  # of training
     cameras: tuple[StoredCamera, ...] = ()
     pose_refinement: PoseRefinement | None = None  # of the cameras; None if nothing is known
     unit: LengthUnit = "units"  # of all lengths in the map; "units" if their length is unknown
     # Origin of the map's own coordinates, in the world frame of the poses passed to and returned by the map. All
     # positions in the map, such as those of its cameras and bounds, are relative to the origin, since single precision
     # resolves only decimetres in survey coordinates.
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    added: int = 0  # number of cameras added after training, at the end of ``cameras``
-    gravity_up: tuple[float, float, float] | None = None  # upward direction (world), if the capture measured gravity
+    origin: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
+    added: WholeNumber = 0  # number of cameras added after training, at the end of ``cameras``
+    # upward direction (world), if the capture measured gravity
+    gravity_up: tuple[Coordinate, Coordinate, Coordinate] | None = None
     field_frame: FieldFrame | None = None  # set if the map was scaled after training
     distances: bool = True  # False if all images are from one place and thus do not determine distances
-    sparse_depth: int = 0  # number of training pixels whose depth came from structure from motion
-    hidden: int = 0  # number of training pixels that masks hid
+    sparse_depth: WholeNumber = 0  # number of training pixels whose depth came from structure from motion
+    hidden: WholeNumber = 0  # number of training pixels that masks hid
     weights: str = ""  # file names
     training: str | None = None  # the state needed to resume; dropped when training is complete
     surface: str | None = None  # baked from these weights
@@ -104,7 +117,7 @@ class MapInfo:
     landmark_features: str = USUAL_FEATURES  # name of the detector of their keypoints
     capture: str | None = None  # capture record of the photos the landmarks were built from
     anchor: Anchor | None = None  # where on earth the map lies, if known
-    colour_noise: float | None = None  # root mean square error of rendered colours on training images
+    colour_noise: Share | None = None  # root mean square error of rendered colours on training images
     bidnerf: str = field(default_factory=lambda: version("bidnerf"))
     format: str = "bidnerf map"
     version: int = VERSION
@@ -173,5 +186,9 @@ def load_info(folder: Path) -> MapInfo:
             info, anchor=from_plain(Anchor, read_json(folder / ANCHOR, "the anchor of a map"), str(folder / ANCHOR))
         )
     for name in cameras_with_invalid_pose(info.cameras):
-        raise InputError(f"pose of camera {name!r} is not a rigid transform", where=path, expected="4x4 rows")
+        raise InputError(
+            f"pose of camera {name!r} is not a rigid transform",
+            where=path,
+            expected=f"4x4 rows, at most {LARGEST_LENGTH:g} from the origin",
+        )
     return info

@@ -30,7 +30,6 @@ from bidnerf_core.captures import (
 from bidnerf_core.datasets import AS_STORED, DatasetOptions
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.fields import (
-    LARGEST_LENGTH,
     RadianceField,
     RenderedImage,
     SceneBounds,
@@ -70,6 +69,7 @@ from bidnerf_core.maps.store import (
 from bidnerf_core.maps.summary import MapSummary
 from bidnerf_core.maps.views import ViewSource, views_again
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context, log
+from bidnerf_core.settings import LARGEST_LENGTH
 from bidnerf_core.training import TrainingState
 
 USUAL_BAKE = BakeConfig()

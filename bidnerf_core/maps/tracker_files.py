@@ -10,7 +10,6 @@ from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields import LARGEST_LENGTH
 from bidnerf_core.io import (
     TensorKind,
     check_tensors,
@@ -23,6 +22,7 @@ from bidnerf_core.io import (
     write_file,
 )
 from bidnerf_core.localization import TrackerState
+from bidnerf_core.settings import LARGEST_LENGTH
 
 STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 11
 STATE_KINDS = {

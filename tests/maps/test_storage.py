@@ -454,6 +454,21 @@ EYE = torch.eye(4).tolist()
             "1e+308",
         ),
         ({"field_frame": {"scale": 0.0, "bounds": PLAIN["bounds"]}}, "field_frame", "0.0"),
+        ({"field_frame": {"scale": 1e30, "bounds": PLAIN["bounds"]}}, "field_frame: scale", "1e+30"),
+        (
+            {"cameras": [PLAIN["cameras"][0] | {"T_world_camera": [[1.0, 0.0, 0.0, 1e30], *EYE[1:]]}]},
+            "camera",
+            "at most 1e+15 from the origin",
+        ),
+        ({"cameras": [PLAIN["cameras"][0] | {"T_world_camera": [*EYE[:3], [0.0, 0.0, 0.0, 1e30]]}]}, "camera", "rigid"),
+        ({"cameras": [PLAIN["cameras"][0] | {"moved_pixels": -1.0}]}, "moved_pixels", "0 to 1,000,000"),
+        ({"cameras": [PLAIN["cameras"][0] | {"motion": [1e30, 0.0, 0.0, 0.0, 0.0, 0.0]}]}, "motion", "1e+30"),
+        ({"origin": [0.0, 1e30, 0.0]}, "origin", "1e+30"),
+        ({"gravity_up": [0.0, 1e30, 0.0]}, "gravity_up", "1e+30"),
+        ({"colour_noise": 1e30}, "colour_noise", "0 to 1"),
+        ({"step": -1}, "step", "a number from 0 up"),
+        ({"seconds": -1.0}, "seconds", "a number from 0 up"),
+        ({"added": -1}, "added", "a number from 0 up"),
     ],
 )
 def test_descriptions_of_what_cannot_be_are_refused(

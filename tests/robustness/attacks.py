@@ -125,8 +125,8 @@ def check(name: str, door: Callable[[], object], file: Path) -> Check:
 
 def database(script: str, file: Path) -> None:
     file.unlink(missing_ok=True)
-    with contextlib.closing(sqlite3.connect(file)) as opened, opened:
-        opened.executescript(script)
+    with contextlib.closing(sqlite3.connect(file)) as opened:
+        opened.executescript(f"BEGIN; {script} COMMIT;")
 
 
 TABLE = (
@@ -439,10 +439,3 @@ def routes(work: Path) -> Checks:
             yield Check(name, tuple(wrong))
     log = (work / "site/log").read_text(errors="replace")
     yield Check("the log of the service", ("a traceback",) if "Traceback" in log else ())
-
-
-def checks(work: Path, count: int) -> Checks:
-    """Yield the checks of all kinds: a sample of ``count`` attacks on readers, and all others."""
-    for number, part in enumerate((partial(readers, count=count), files, routes)):
-        (work / str(number)).mkdir()
-        yield from part(work / str(number))

@@ -393,4 +393,4 @@ def large_inputs(work: Path) -> Checks:
         ),
     }
     for name, (door, memory) in cases.items():
-        yield Check(name, tuple(defects(run(door, work / "case", 60, memory=memory))))
+        yield Check(name, tuple(defects(run(door, work / "case", memory=memory))))

@@ -79,6 +79,11 @@ class Guarded:
             yield "read outside"
 
 
+def guarded(work: Path) -> Guarded:
+    """Return a runner in an empty folder, in which it writes the sound files."""
+    return Guarded(work, sound_folder(work / "sound"))
+
+
 def in_json(file: str, value: str, *keys: Any) -> Edit:
     """Put JSON text at ``keys`` of a file."""
 
@@ -485,10 +490,3 @@ def form(**fields: tuple[bytes | None, bytes]) -> bytes:
             b'--x\r\nContent-Disposition: form-data; name="' + name.encode() + b'"' + more + b"\r\n\r\n" + value
         )
     return b"\r\n".join([*rows, b"--x--\r\n"])
-
-
-def checks(work: Path) -> Checks:
-    """Yield the checks of all kinds."""
-    guarded = Guarded(work, sound_folder(work / "sound"))
-    for part in (current_folder, clients, maps, results, cameras, paths):
-        yield from part(guarded)

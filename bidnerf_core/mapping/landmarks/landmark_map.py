@@ -25,6 +25,7 @@ from bidnerf_core.mapping.landmarks.descriptors import (
     unrelated_distance,
 )
 from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
+from bidnerf_core.settings import Degrees, Length, NotNegative, Positive, Settings, WholeNumber
 
 MOST_IN_CELL = 128
 """Maximum number of landmarks in a cell."""
@@ -33,18 +34,20 @@ FEW = 20_000
 
 
 @dataclass(frozen=True)
-class HeldOutTrial:
+class HeldOutTrial(Settings):
     """Accuracy with which images of the map were localized by landmarks that were built without these images."""
 
-    images: int = 0
-    found: int = 0  # number of these images whose pose was found
-    translation: float = 0.0  # metres: median error
-    rotation_deg: float = 0.0
+    images: WholeNumber = 0
+    found: WholeNumber = 0  # number of these images whose pose was found
+    translation: Length = 0.0  # metres: median error
+    rotation_deg: Degrees = 0.0
     # Factors by which the information of points on the surface and of rendered rays exceeds that of independent measurements.
     # They are unknown for points in a map without measured depth, whose surface has the errors of the field's depth.
-    points: float = 10.0
-    rays: float = 3.0
-    difference: float = 0.0  # usual mean loss of rays at a right pose, in squares of the loss's scale; 0 if unknown
+    points: Positive = 10.0
+    rays: Positive = 3.0
+    difference: NotNegative = (
+        0.0  # usual mean loss of rays at a right pose, in squares of the loss's scale; 0 if unknown
+    )
 
     def scaled(self, factor: float) -> HeldOutTrial:
         """Return the trial in a map with lengths multiplied by ``factor``."""
