@@ -486,7 +486,7 @@ def test_keys_of_a_newer_version_are_ignored_with_a_warning(tmp_path: Path) -> N
     described(tmp_path, mirrored=True, bidnerf="99.1")
     with pytest.warns(InputWarning, match=r"map\.json: ignored mirrored, .*; bidnerf 99\.1 wrote the map$"):
         assert load_info(tmp_path).bidnerf == "99.1"
-    for changes, fault in (({"version": 2}, "version 2"), ({"step": "many"}, "found 'many'")):
+    for changes, fault in (({"version": 2}, "version 2"), ({"step": "many"}, "step is 'many'")):
         described(tmp_path, bidnerf="99.1", **changes)
         with refused(where="map.json", found=fault, expected="or earlier; bidnerf 99.1 wrote it, so upgrade bidnerf"):
             load_info(tmp_path)

@@ -126,12 +126,18 @@ def step_of(folder: Path) -> int:
 
 
 def parts(folder: Path, names: Sequence[str]) -> object:
-    """Return the bytes of the map's files, and check that there are no others."""
+    """Return the bytes of the map's files."""
     plain = json.loads((folder / "map" / "map.json").read_text())
-    named = {"map.json", *(v for v in plain.values() if isinstance(v, str))}
-    if others := {file.name for file in (folder / "map").iterdir()} - named:
-        raise Broken(f"files that map.json does not name: {sorted(others)}")
     return [(folder / "map" / plain[part]).read_bytes() for part in names]
+
+
+def wrong_result(job: Job, folder: Path, expected: object, finished: bool = True) -> list[str]:
+    """Return what is wrong with a result; where the last process ``finished``, a map's folder has no files that it does not name."""
+    wrong, description = [] if job.result(folder) == expected else [OTHER_RESULT], folder / "map" / "map.json"
+    if finished and description.exists():
+        named = {description.name, *(v for v in json.loads(description.read_text()).values() if isinstance(v, str))}
+        wrong += [f"not named: {file.name}" for file in description.parent.iterdir() if file.name not in named]
+    return wrong
 
 
 def rows(path: Path) -> list[dict[str, Any]]:
@@ -169,9 +175,10 @@ def kill(job: Job, work: Path, expected: object, seconds: float, kills: int, cha
         found = stop(job, folder, signal.SIGKILL, chance.uniform(0, 1.1 * seconds))
         wrong = damage_of(job, folder, before)
         before = 0 if wrong else job.kept(folder)
-        # Resuming is refused after a kill between the last write and the end of the process.
+        # Resuming is refused after a kill between the last write and the end of the process, in which earlier files are removed;
+        # the next save removes them then.
         if found.ending == "done" or "nothing to resume" in found.last:
-            wrong += [] if job.result(folder) == expected else [OTHER_RESULT]
+            wrong += wrong_result(job, folder, expected, found.ending == "done")
             rounds, before = rounds + 1, 0
             folder = work / str(rounds)
             folder.mkdir()
@@ -249,7 +256,7 @@ def full_disk(job: Job, work: Path, expected: object) -> Checks:
         )
         wrong += damage_of(job, folder, 0) + half_written(folder, frozenset())
         run_undisturbed(job, folder)
-        wrong += [] if job.result(folder) == expected else [OTHER_RESULT]
+        wrong += wrong_result(job, folder, expected)
         yield Check(f"write {number}", tuple(wrong))
 
 

@@ -6,7 +6,7 @@ import dataclasses
 import math
 import types
 from collections.abc import Callable
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import torch
 from hypothesis import strategies as st
@@ -17,6 +17,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.geometry import SE3
+from bidnerf_core.settings import Above, Range
 
 numbers = st.floats(-1e6, 1e6)
 shares = st.floats(0, 1)
@@ -97,8 +98,15 @@ def record(kind: Any, **given: SearchStrategy[Any]) -> SearchStrategy[Any]:
     """Any value of an annotated type, such as a dataclass of plain data; ``given`` draws some fields of this one."""
     if kind in SPECIAL:
         return SPECIAL[kind]()
+    if get_origin(kind) is Annotated:
+        kind, *notes = get_args(kind)
+        limits = next((note for note in notes if isinstance(note, Range)), None)
+        if limits is None or isinstance(limits, Above):
+            return record(kind).filter(lambda value: limits is None or value in limits)
+        least, most = max(limits.least, -1e6), min(limits.most, 1e6)
+        return st.floats(least, most) if kind is float else st.integers(int(least), int(most))
     if dataclasses.is_dataclass(kind):
-        hints, names = get_type_hints(kind), [f.name for f in dataclasses.fields(kind)]
+        hints, names = get_type_hints(kind, include_extras=True), [f.name for f in dataclasses.fields(kind)]
         fields = {name: record(hints[name]) for name in names if name not in given}
         return st.builds(kind, **(fields | given))
     origin, parts = get_origin(kind), get_args(kind)
