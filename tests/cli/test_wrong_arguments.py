@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -36,7 +37,7 @@ def test_a_wrong_command_line_is_answered_in_one_line_and_leaves_nothing(
 ) -> None:
     monkeypatch.chdir(place)
     before = sorted(place.rglob("*"))
-    found = bidnerf(*case.line.split())
+    found = bidnerf(*shlex.split(case.line))
     command, help_page = case.line.split()[0], f"; 'bidnerf {case.line.split()[0]} --help' describes all arguments"
     expected = f"bidnerf {command}: {case.answer}"
     if case.answer.endswith("..."):

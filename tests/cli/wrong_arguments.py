@@ -12,6 +12,7 @@ import importlib.abc
 import json
 import os
 import re
+import shlex
 import shutil
 import sys
 import tempfile
@@ -97,7 +98,7 @@ def answers(folder: Path, cases: list[Case], blocked: bool) -> Iterator[Answer]:
         if blocked:
             sys.meta_path.insert(0, NoTorch())
         since = time.process_time()
-        status = main(case.line.split())
+        status = main(shlex.split(case.line))
         used = time.process_time() - since
         print(json.dumps([began + used, "torch" in sys.modules]), file=sys.stderr)
         return status
