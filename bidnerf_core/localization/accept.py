@@ -107,7 +107,8 @@ LANDMARK_BOUNDS = (
         -12.0,
         False,
         Outcome.TOO_FEW_MATCHES,
-        "so few matches agree that chance alone would give {0:.0e} such poses, accepted are at most {1:.0e}",
+        "so few landmarks agree that it may be by chance: {0:.0e} such poses are expected of an image of another place, at most"
+        " {1:.0e} are accepted",
     ),
     Bound("inliers", 15, True, Outcome.TOO_FEW_MATCHES, "only {0:.0f} landmark inliers, expected {1:g}", True, 10),
     Bound("mirrored", 0, False, Outcome.MIRRORED, "the mirror image fits the map better than the image", True),

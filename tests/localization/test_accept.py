@@ -105,7 +105,11 @@ def test_of_several_reasons_the_most_serious_is_stated() -> None:
 
 
 def test_a_pose_that_landmarks_only_confirm_needs_no_matches_by_descriptors() -> None:
-    assert not judge(replace(SOUND, log10_nfa=0.0)).accepted
+    refused = judge(replace(SOUND, log10_nfa=0.0))
+    assert (refused.accepted, "1e+00 such poses are expected of an image of another place" in refused.reason) == (
+        False,
+        True,
+    )
     assert judge(replace(SOUND, log10_nfa=0.0, searched=False)).accepted
 
 
