@@ -191,22 +191,23 @@ def pose_sentences(cameras: Sequence[StoredCamera], refinement: PoseRefinement) 
 
 
 def apply_stored_poses(views: Sequence[View], cameras: Sequence[StoredCamera]) -> list[View]:
-    """Return the views with the refined poses and motions from ``cameras``, matched by name and given pose.
+    """Return the views with the refined poses and motions from ``cameras``, matched by name and, but for rounding, by given pose.
 
     Views whose pose was not refined are returned unchanged.
     """
-    known = {(c.name, c.given_T_world_camera): c for c in cameras if c.given_T_world_camera}
-    stored = [known.get((view.frame.name, _rows(view.T_ref_camera))) for view in views]
-    return [
-        view
-        if c is None
-        else replace(
-            view,
-            T_ref_camera=c.pose,
-            motion=None if c.motion is None else torch.tensor(c.motion, dtype=torch.float64),
-        )
-        for view, c in zip(views, stored, strict=True)
-    ]
+    known, applied = {camera.name: camera for camera in cameras if camera.given_T_world_camera}, list[View]()
+    for view in views:
+        camera = known.get(view.frame.name)
+        given = None if camera is None else camera.given_T_world_camera
+        if (
+            camera is not None
+            and given
+            and torch.allclose(_pose(given).matrix(), view.T_ref_camera.matrix(), 1e-6, 1e-6)
+        ):
+            motion = None if camera.motion is None else torch.tensor(camera.motion, dtype=torch.float64)
+            view = replace(view, T_ref_camera=camera.pose, motion=motion)
+        applied.append(view)
+    return applied
 
 
 def _rows(T: SE3) -> MatrixRows:

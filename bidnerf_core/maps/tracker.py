@@ -102,9 +102,14 @@ class Tracker:
 
         ``time`` (seconds, from any origin) is its time stamp; without one, the last interval is assumed. If the pose is
         rejected, the answer has an ``outcome`` other than ``CONVERGED``, and its pose is the best estimate with a corresponding
-        covariance, or NaN before the sequence has been recognised. Raises ``InputError`` for a non-finite time, and if the map does not allow the first frame to be found
-        without a start.
+        covariance, or NaN before the sequence has been recognised. Raises ``InputError`` for a non-finite time, for anything but a frame, and if
+        the map does not allow the first frame to be found without a start.
         """
+        if not isinstance(frame, Frame):
+            raise InputError(
+                f"frame is a {type(frame).__name__}",
+                expected="a Frame; Frame.open reads a photo, Frame.from_numpy an array",
+            )
         began = clocks.perf_counter()
         clock, seconds = self._state.clock.step(time)
         frame = frame.over(self.localizer.scene.bounds.background)

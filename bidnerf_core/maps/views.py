@@ -35,7 +35,7 @@ from bidnerf_core.frames import (
     bytes_of,
     masks_sentence,
 )
-from bidnerf_core.geometry import LengthUnit
+from bidnerf_core.geometry import SE3, LengthUnit
 from bidnerf_core.io import available_memory, background_colour
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.progress import counter, log
@@ -87,6 +87,16 @@ class ReadViews:
         return replace(
             self, views=[replace(view, T_ref_camera=view.T_ref_camera.translated(offset)) for view in self.views]
         )
+
+    def scaled(self, factor: float) -> ReadViews:
+        """Return the views with all lengths, poses and measured depth, multiplied by ``factor``."""
+
+        def scale(view: View) -> View:
+            T, depth = view.T_ref_camera, view.frame.depth
+            frame = view.frame if depth is None else view.frame.replace(depth=depth * factor)
+            return replace(view, frame=frame, T_ref_camera=SE3(T.rotation, T.translation * factor))
+
+        return self if factor == 1 else replace(self, views=[scale(view) for view in self.views])
 
     def with_files(self, cameras: Sequence[StoredCamera]) -> tuple[StoredCamera, ...]:
         """Return the cameras of the views, with the file of each image.
@@ -246,10 +256,19 @@ def views_again(
 ) -> tuple[ReadViews, list[View]]:
     """Read images of the map that ``info`` describes, as ``read_views`` does, with poses relative to the map's origin.
 
-    The background is by default that with which the training of the field began. Also returns the views at the
-    poses stored in the map, which training may have refined.
+    The background is by default that with which the training of the field began. Of a map that was scaled after training, the
+    images may be in the unit of before, in which case they are scaled as the map was. Also returns the views at the poses stored
+    in the map, which training may have refined.
     """
     if options.background is None and isinstance(data, str | Path) and info.backend:
         options = replace(options, background=info.bounds.background)
-    read = read_views(data, options, depth_points, point_choice, folder).about(info.origin)
+    read = read_views(data, options, depth_points, point_choice, folder)
+    poses = {camera.name: camera.pose for camera in info.cameras}
+    pairs = [(view.T_ref_camera, poses[view.frame.name]) for view in read.views if view.frame.name in poses]
+    if pairs and info.field_frame is not None:
+        given, own = (torch.stack([T.translation for T in part]) for part in zip(*pairs, strict=True))
+        own, factors = own + torch.tensor(info.origin, dtype=torch.float64), (1.0, info.field_frame.scale)
+        factor = min(factors, key=lambda factor: float((factor * given - own).norm(dim=-1).median()))
+        read = read.scaled(factor)
+    read = read.about(info.origin)
     return read, apply_stored_poses(read.views, info.cameras)

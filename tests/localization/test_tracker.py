@@ -181,6 +181,13 @@ def test_time_stamps_may_be_missing(known: int) -> None:
 
 
 @pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("given", ["photo.jpg", [[0.0]], None])
+def test_anything_but_a_frame_is_refused(given: Any) -> None:
+    with refused(found=f"frame is a {type(given).__name__}"):
+        Tracker(localizer())(given, 0.0)
+
+
+@pytest.mark.usefixtures("unchecked")
 def test_a_time_that_is_no_number_is_refused_and_changes_nothing() -> None:
     tracker = Tracker(localizer())
     tracked(flight()[:2], tracker)

@@ -14,12 +14,14 @@ import tiny
 from bidnerf.results import read_positions
 from bidnerf.testing import BOUNDS, GROUND_CAMERA, textured_map, unseen
 from bidnerf_core.captures import stored_cameras
+from bidnerf_core.captures.cameras import record_refinement
 from bidnerf_core.fields import levels
 from bidnerf_core.io import FileInUse, lock
 
 # Inside: the place of a map by its name
 from bidnerf_core.maps import Anchor, Map, MapInfo, factor_of_distance, factor_of_poses, load_info
 from bidnerf_core.maps.known_lengths import locate_point
+from bidnerf_core.maps.views import views_again
 from commands import Run, assert_refused
 from optional import require
 from refusals import refused
@@ -108,6 +110,30 @@ def test_known_poses_give_the_factor(ground: Map) -> None:
     }
     with refused(found="m (root mean square)", expected="known positions of the same capture"):
         factor_of_poses(ground, wrong)
+
+
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (4e5, -2e5, 100.0)])
+def test_images_in_the_unit_of_before_are_scaled_as_their_map_was(origin: tuple[float, float, float]) -> None:
+    """Also those whose poses training had refined; images in the unit of the map stay as they are."""
+    offset, view = torch.tensor(origin, dtype=torch.float64), unseen()
+    moves = torch.eye(3, 6, dtype=torch.float64)
+    given = [bn.View(view.frame.replace(name=f"c{n}"), view.T_ref_camera.retract(move)) for n, move in enumerate(moves)]
+    refined = [replace(v, T_ref_camera=v.T_ref_camera.retract(0.01 * moves[0])) for v in given]
+    cameras = record_refinement(given, stored_cameras(refined), [1.0, 1.0, 1.0])
+    info = MapInfo("ground", {}, BOUNDS, 1, True, "data", weights="ground", cameras=cameras, origin=origin)
+    in_world = [replace(v, T_ref_camera=v.T_ref_camera.translated(offset)) for v in given]
+    large = info.scaled(2.5, "metres")
+    in_metres = [
+        replace(v, T_ref_camera=bn.SE3(v.T_ref_camera.rotation, 2.5 * v.T_ref_camera.translation)) for v in in_world
+    ]
+    for views, factor in ((in_world, 2.5), (in_metres, 1.0)):
+        read, posed = views_again(large, views)
+        for one, other in zip(read.views, given, strict=True):
+            expected = 2.5 * other.T_ref_camera.translation
+            torch.testing.assert_close(one.T_ref_camera.translation, expected, atol=1e-6, rtol=0)
+            torch.testing.assert_close(require(one.frame.depth), factor * require(other.frame.depth))
+        assert [v.T_ref_camera.matrix().tolist() for v in posed] == [c.pose.matrix().tolist() for c in large.cameras]
+    assert views_again(info, in_world)[0].views[0].frame is in_world[0].frame
 
 
 def test_a_map_in_metres_that_is_scaled_again_is_remarked(ground: Map, caplog: pytest.LogCaptureFixture) -> None:
