@@ -5,9 +5,12 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import sys
 import threading
+from _thread import interrupt_main
 from collections.abc import Callable, Iterator
 from types import FrameType
+from typing import Any
 
 from bidnerf_core.errors import Cancelled, InputError
 
@@ -53,13 +56,22 @@ def interruptions() -> Iterator[None]:
     """Make SIGINT, SIGTERM and SIGHUP raise ``Interrupted``. Signals that are ignored, as under nohup, stay ignored.
 
     An import that is interrupted may fail in another way, as NumPy's does with a ``RecursionError``: an unexpected error after a signal
-    is an ``Interrupted``, too.
+    is an ``Interrupted``, too. One that Python ignores, as in the callback of a weak reference, is raised again after a moment.
     Has no effect outside the main thread, the only thread that may handle signals.
     """
     in_main = threading.current_thread() is threading.main_thread()
     usual, handler = (signal.SIG_DFL, signal.default_int_handler), Handler()
     handled = [number for number in STOP_SIGNALS if in_main and signal.getsignal(number) in usual]
     before = {number: signal.signal(number, handler) for number in handled}
+    usual_hook = sys.unraisablehook
+
+    def raise_again(unraisable: Any) -> None:
+        if isinstance(unraisable.exc_value, Interrupted):
+            threading.Timer(0.01, interrupt_main, [unraisable.exc_value.number]).start()
+        else:
+            usual_hook(unraisable)
+
+    sys.unraisablehook = raise_again
     try:
         yield
     except Exception as error:
@@ -67,6 +79,7 @@ def interruptions() -> Iterator[None]:
             raise
         raise Interrupted(handler.raised) from error
     finally:
+        sys.unraisablehook = usual_hook
         for number, handler_before in before.items():
             signal.signal(number, handler_before)
 

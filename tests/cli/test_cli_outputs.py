@@ -191,6 +191,23 @@ def test_an_unexpected_error_after_a_signal_is_an_interruption(
         fail()
 
 
+def test_an_interruption_that_python_ignores_is_raised_again(capfd: pytest.CaptureFixture[str]) -> None:
+    class Ignoring:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGTERM)
+
+    def work() -> None:
+        with interruptions():
+            Ignoring()
+            until = time.monotonic() + 30
+            while time.monotonic() < until:
+                time.sleep(0.01)
+
+    with pytest.raises(Interrupted, match="SIGTERM"):
+        work()
+    assert capfd.readouterr().err == ""
+
+
 def test_handlers_are_as_before_after_a_command_and_ignored_signals_stay_ignored(bidnerf: Run) -> None:
     asked_to_stop, logger = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP), logging.getLogger("bidnerf")
     before = [signal.getsignal(number) for number in asked_to_stop]
