@@ -158,7 +158,7 @@ def on_cluster(photos: Path, out: Path, kill: bool) -> Row:
     killed = list[int]()
 
     def run(stages: Stages) -> Row:
-        with LocalCluster(WORKERS, threads_per_worker=1, processes=True, dashboard_address=None) as local:
+        with LocalCluster(n_workers=WORKERS, threads_per_worker=1, processes=True, dashboard_address=None) as local:
 
             def progress(now: Progress) -> None:
                 stages(now)

@@ -327,7 +327,7 @@ def test_a_cluster_whose_worker_is_killed_places_the_same_photos(search: Search)
 
     out = search.out.with_name("poses of a cluster")
     with (
-        distributed.LocalCluster(2, threads_per_worker=1, processes=True, dashboard_address=None) as local,
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as local,
         bn.cluster(local.scheduler_address),
     ):
         bn.find_poses(search.photos, out, progress=kill_a_worker)
