@@ -195,6 +195,21 @@ def test_an_image_of_another_thing_is_rejected(changed: Callable[[View], View]) 
     assert found.covariance is not None
 
 
+def test_no_rays_are_rendered_for_an_image_that_disagrees_with_the_surface_everywhere(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    judge = Mock(return_value=answer())
+    monkeypatch.setattr(import_module("bidnerf_core.localization.by_surface"), "localization_by_rays", judge)
+    view = baked.unseen()[0]
+    other = replace(view, frame=replace(view.frame, rgb=1 - view.frame.rgb))
+    found = found_for(baked.problem(other).without_depth())
+    assert found.outcome is Outcome.RENDERING_MISMATCH
+    assert "of the image agree with the surface in a small size, expected 70%" in found.reason
+    assert judge.call_count == 0
+    assert found_for(baked.problem(view).without_depth()).converged
+    assert judge.call_count == 1
+
+
 def test_what_looks_the_same_from_two_sides_is_ambiguous() -> None:
     """A box that half a turn maps onto itself."""
     scene = baked.even_box()

@@ -72,7 +72,7 @@ def test_auto_by_depth() -> None:
 def test_auto_by_colour(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is rejected, as a part of the image is in one colour."""
     by_surface = import_module("bidnerf_core.localization.by_surface")
-    monkeypatch.setattr(by_surface, "IMAGE_STAGES", ((16, 0, 4), (16, 8, 2), (48, 6, 2)))
+    monkeypatch.setattr(by_surface, "IMAGE_STAGES", ((16, 0, 4, 0.0), (16, 8, 2, 0.0), (48, 6, 2, 0.0)))
     (view,) = module_fields.shown(1, seed=5)
     frame = without_depth(view.frame)
     rgb = frame.rgb.clone()

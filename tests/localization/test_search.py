@@ -64,6 +64,15 @@ def test_a_stage_may_compare_poses_by_another_score() -> None:
     assert float(found.states.T.translation[0, 0]) == pytest.approx(5.0, abs=1e-2)
 
 
+@pytest.mark.parametrize(("most", "complete"), [(1.1, True), (0.9, False)])
+def test_a_search_ends_where_even_the_best_pose_is_worse_than_a_stage_allows(most: float, complete: bool) -> None:
+    """The best of the starts costs 1."""
+    found = halve(STARTS, [Stage([two_valleys], 0, 3, most=most), Stage([two_valleys], 10, 1)], MIDDLE)
+    assert found.complete is complete
+    assert float(found.states.T.translation[0, 0]) == pytest.approx(0.0 if complete else -0.1, abs=1e-2)
+    assert len(found.states) == (1 if complete else 3)
+
+
 @pytest.mark.parametrize("by_points", [True, False])
 @pytest.mark.parametrize("count", [2, 33])
 def test_hypotheses_are_distinct_and_begin_at_a_start(count: int, by_points: bool) -> None:

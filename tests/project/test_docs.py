@@ -131,7 +131,7 @@ def quick_auto(monkeypatch: pytest.MonkeyPatch, no_processes: None) -> None:
         )
         return auto.solve(problem, few, seed)
 
-    monkeypatch.setattr("bidnerf_core.localization.by_surface.IMAGE_STAGES", ((8, 1, 2), (8, 1, 1)))
+    monkeypatch.setattr("bidnerf_core.localization.by_surface.IMAGE_STAGES", ((8, 1, 2, 0.0), (8, 1, 1, 0.0)))
     monkeypatch.setitem(registered, ("methods", "auto"), dataclasses.replace(auto, solve=quick))
 
 
