@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from bidnerf.cli.options import (
     TEST_IMAGES,
     BakeSettings,
+    CameraOptions,
     ColourImages,
     Device,
     First,
@@ -20,6 +21,7 @@ from bidnerf.cli.options import (
     MappedImages,
     NewMap,
     Overwrite,
+    PhotoCamera,
     RunOptions,
     WholeImages,
     existing,
@@ -29,7 +31,7 @@ from bidnerf.cli.options import (
     require_one,
 )
 from bidnerf.cli.output import check_folder, check_output, print_result, say
-from bidnerf.cli.parameters import Flag, Group, Option, SettingsGroup
+from bidnerf.cli.parameters import Flag, Group, Option, SettingsGroup, Without
 from bidnerf.cli.running import display_progress, interruptible_work
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.progress import counter
@@ -307,9 +309,9 @@ def run_extend(
         WholeNumbers(1),
         Option("N", "training steps", "in proportion to the new photos, at least a quarter of the usual number"),
     ] = None,
-    device: Device = "cpu",
-    json: Json = False,
     *,
+    run: Annotated[RunOptions, Without("overwrite")],
+    camera: PhotoCamera,
     images: WholeImages,
     config: BakeSettings = None,
 ) -> None:
@@ -322,8 +324,10 @@ def run_extend(
     from bidnerf_core.datasets import Photos, find_reader, photo_files
     from bidnerf_core.maps import extend, load_info
 
-    require_device(device)
+    require_device(run.device)
     info = load_info(map)
+    if camera != CameraOptions():
+        images = replace(images, camera=camera.source(images.camera))
     of_depth = {"--register-depth": images.register_depth, "--depth-unit": images.depth_unit}
     is_stated = any(value is not None for value in (images.camera, *of_depth.values()))
     paths = [new] if data is None else [new, data]
@@ -331,17 +335,18 @@ def run_extend(
     if not datasets:
         refuse(of_depth, f"is for a dataset, but {new} is none; leave it out")
     options = replace(images, background=info.bounds.background)
-    opened: dict[Path, Path | Capture] = {path: options.open(path) for path in datasets}
+    of_map = options if new in datasets else replace(options, camera=None)  # which is then that of the photos
+    opened: dict[Path, Path | Capture] = {path: (of_map if path == data else options).open(path) for path in datasets}
     if images.camera is not None and new not in datasets:
         opened[new] = Photos(photo_files([new]), options).capture
     known = None if data is None else opened.get(data, data)
     with interruptible_work(kept=f"stopped; {map} is unchanged"):
         scene = extend(
-            map, opened.get(new, new), known, split=images.split, steps=steps, config=config(), device=device
+            map, opened.get(new, new), known, split=images.split, steps=steps, config=config(), device=run.device
         )
     added, total = len(scene.info.cameras) - len(info.cameras), len(scene.info.cameras)
     text = f"{map}: {amount(added, 'photo')} added, {amount(total, 'image')} in all"
-    print_result(scene.describe().plain(), [text], json)
+    print_result(scene.describe().plain(), [text], run.json)
 
 
 def _importer_settings(values: Mapping[str, Any], words: Sequence[str]) -> Any:

@@ -293,7 +293,7 @@ class QueryOptions:
             from bidnerf_core.datasets import DatasetFrames
 
             if len(paths) > 1:
-                raise UsageError(f"{len(paths)} queries including a dataset", expected="only the dataset")
+                raise UsageError(f"{len(paths)} queries, one of which is a dataset", expected="the dataset alone")
             refuse(
                 {"--depth": self.depth, "--focal": self.camera.focal, "--hfov": self.camera.hfov},
                 f"is for photos, but {paths[0]} is a dataset, which has its own; to use its images as photos, name the files",

@@ -245,7 +245,9 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise ``UsageError``. An unknown option is reported instead of ``message``, since it explains the other errors."""
         words, options = getattr(self, "_words", ()), self._option_string_actions
-        message = re.sub(r"^argument \[?([^]: ]+)\S*: ", r"\1 ", message)
+        message = re.sub(r"^argument \[?([^]: ]+)\S*: ", r"\1 ", message).replace(
+            "ignored explicit argument", "takes no value, got"
+        )
         if (name := self.unknown_option(words)) is not None:
             message = f"no option {name!r}{spelling_hint(name, options)}"
         elif message.startswith(MISSING_ARGUMENTS):

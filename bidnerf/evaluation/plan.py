@@ -89,9 +89,11 @@ class Protocol:
         """Raise ``InputError`` for a size with the wrong number of values, or with a value out of range."""
         most = [180.0 if "deg" in unit else 1e6 for unit in self.units]  # degrees, metres
         if len(size) != len(self.units) or not all(0 <= x <= m for x, m in zip(size, most, strict=True)):
-            expected = " : ".join(self.units) or "none, since this protocol has no sizes, as bid and others have"
-            limits = f", 0 to {' : '.join(f'{m:g}' for m in most)}" if most else ""
-            raise InputError(f"size is {':'.join(f'{x:g}' for x in size) or 'missing'}", expected=f"{expected}{limits}")
+            ranges = [f"{unit} from 0 to {largest:g}" for unit, largest in zip(self.units, most, strict=True)]
+            raise InputError(
+                f"size is {':'.join(f'{x:g}' for x in size) or 'missing'}",
+                expected=" : ".join(ranges) or "none with this protocol; bid, bid-hard and perturb have sizes",
+            )
 
 
 PROTOCOLS = {

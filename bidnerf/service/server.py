@@ -180,8 +180,8 @@ def maps_by_name(scenes: Scenes) -> dict[str, Path]:
     for name, folder in pairs:
         if not re.fullmatch(r"[\w.-]{1,100}", name) or name in (".", "..") or names.count(name) > 1:
             raise UsageError(
-                f"its name is {name!r}",
+                f"two maps are named {name!r}" if names.count(name) > 1 else f"its name is {name!r}",
                 where=folder,
-                expected="another one for each map, of letters, digits, '.', '-' and '_'; give it a name: NAME=MAP",
+                expected="a name of its own for each, of letters, digits, '.', '-' and '_', given as NAME=MAP",
             )
     return {name: Path(folder) for name, folder in pairs}

@@ -34,7 +34,6 @@ from .queries import Query as Query
 from .queries import QuerySource as QuerySource
 from .queries import depth_files as depth_files
 from .queries import photo_files as photo_files
-from .queries import window_of as window_of
 from .reader import READERS as READERS
 from .reader import Background as Background
 from .reader import DepthCamera as DepthCamera

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 from bidnerf_core.datasets.capture import Capture
 from bidnerf_core.datasets.formats.photos import PhotoShot
@@ -18,8 +18,6 @@ from bidnerf_core.frames import DEPTH_STEM, Frame, View, photos_in
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import looks_like_image
 from bidnerf_core.progress import log
-
-Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,11 +129,14 @@ class DatasetFrames:
         if not listed:
             raise InputError(f"split {split!r} has no frames", where=dataset.path)
         if window > len(listed):
-            raise InputError(f"`window` is {window}", expected=f"1 to {len(listed)}")
+            raise InputError(
+                f"`window` is {window}", expected=f"1 to {len(listed)}, the number of frames in split {split!r}"
+            )
         dataset.select(split, names)  # raises for an unknown name
         self._rigs = [names] if rig else [(name,) for name in names or listed]
         if window > 1:
-            self._rigs = [window_of(listed, listed.index(name), window) for (name,) in self._rigs]
+            ends = [1 + listed.index(name) for (name,) in self._rigs]
+            self._rigs = [tuple(listed[max(0, end - window) : end]) for end in ends]
             for *before, name in self._rigs:
                 if window > 1 + len(before):
                     log.info(
@@ -202,16 +203,3 @@ def depth_files(photos: Sequence[Path], depth: Sequence[Path]) -> dict[Path, Pat
             expected="one for each, in the same order or matched by name",
         )
     return dict(zip(photos, depth, strict=True))
-
-
-def window_of(sequence: Sequence[Item], last: int, size: int, stride: int = 1) -> tuple[Item, ...]:
-    """Return ``size`` items up to item ``last``, ``stride`` apart; fewer at the beginning of the sequence.
-
-    Views in temporal order give the paper's moving window. Raises ``InputError`` if there is no item ``last``, or for a size or stride
-    below 1.
-    """
-    if size < 1 or stride < 1:
-        raise InputError(f"the window has size {size} and stride {stride}", expected="1 or more for both")
-    if not 0 <= last < len(sequence):
-        raise InputError(f"the window ends at item {last} of {len(sequence)}, which does not exist")
-    return tuple(sequence[i] for i in range(last, -1, -stride)[:size][::-1])

@@ -147,8 +147,11 @@ class Map:
 
     @property
     def colour_noise(self) -> float | None:
-        """Root mean square error of the field's colours (in [0, 1]) on the map's training images; None if unknown."""
-        return self.info.colour_noise
+        """Root mean square error of the field's colours (in [0, 1]) on the map's training images; None if unknown.
+
+        While training is unfinished, it is 1, so that landmarks alone are used where there are some: rendering costs more than it tells.
+        """
+        return self.info.colour_noise if self.info.interruption is None else 1.0
 
     @cached_property
     def capture(self) -> CaptureReport | None:
@@ -279,7 +282,7 @@ class Map:
         """Raise ``InputError`` if photos differ too much from the field's renderings, whether or not the map was built from them."""
         # The difference (RMS) between rendered and photographed colours indicates another scene if it is much larger than for the
         # photos from which the map was built or, in a map that was never baked, if it is large in itself.
-        error, usual = colour_noise(self.field, self.bounds, views), self.colour_noise
+        error, usual = colour_noise(self.field, self.bounds, views), self.info.colour_noise
         if error > (0.3 if usual is None else max(0.2, 2 * usual)):
             raise InputError(
                 f"built from {self.info.data or 'other views'!r}, and its renderings differ from the photos by"

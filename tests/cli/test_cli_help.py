@@ -182,7 +182,7 @@ def test_an_option_means_one_thing_and_is_wherever_it_makes_sense() -> None:
                 commands.setdefault(parameter.flag, set()).add(name)
     assert {flag: each for flag, each in meanings.items() if len(each) > 1 and flag not in WRITTEN} == {}
     assert {flag: {*bundled} - commands[flag] for flag in WITHOUT} == WITHOUT
-    assert commands["--focal"] == commands["--hfov"] == {"localize", "poses", "track", "train", "view"}
+    assert commands["--focal"] == commands["--hfov"] == {"extend", "localize", "poses", "track", "train", "view"}
     assert commands["--frame"] == {"compare", "evaluate", "localize", "render", "view"}
     assert commands["--camera"] - {"poses"} == commands["--split"]
 

@@ -19,7 +19,6 @@ from bidnerf_core.datasets import (
     Capture,
     open_dataset,
     open_sequence,
-    window_of,
     write_transforms,
 )
 from optional import require
@@ -142,19 +141,3 @@ def test_a_recorded_sequence_is_one_video(data_dir: Path) -> None:
     steps = [float((b.translation - a.translation).norm()) for a, b in pairwise(truths) if a and b]
     assert len(steps) == 39
     assert max(steps) < 0.1
-
-
-def test_a_window_is_the_last_items() -> None:
-    items = list("abcdefgh")
-    assert window_of(items, 4, 3) == ("c", "d", "e")
-    assert window_of(items, 7, 3, stride=2) == ("d", "f", "h")
-    assert window_of(items, 1, 3) == ("a", "b")
-    assert window_of(items, 0, 1) == ("a",)
-    for wrong, found in (
-        ((8, 1), "at item 8 of 8"),
-        ((-1, 1), "at item -1 of 8"),
-        ((0, 0), "size 0 and stride 1"),
-    ):
-        with refused(found=found):
-            window_of(items, *wrong)
-    assert len(window_of(items, 7, 100)) == 8

@@ -17,6 +17,7 @@ from bidnerf_core.captures import stored_cameras
 from bidnerf_core.captures.cameras import record_refinement
 from bidnerf_core.fields import levels
 from bidnerf_core.io import FileInUse, lock
+from bidnerf_core.localization import Loop
 
 # Inside: the place of a map by its name
 from bidnerf_core.maps import Anchor, Map, MapInfo, factor_of_distance, factor_of_poses, load_info
@@ -178,6 +179,16 @@ def test_a_factor_is_a_positive_number(ground: Map, factor: float) -> None:
 def test_an_interrupted_training_is_not_scaled(ground: Map) -> None:
     with refused(where="data", found="cannot be scaled: its training stopped at step 1"):
         replace(ground, info=replace(ground.info, complete=False)).scaled(2)
+
+
+@pytest.mark.parametrize("noise", [None, 0.01])
+def test_a_field_whose_training_is_unfinished_is_not_rendered(ground: Map, noise: float | None) -> None:
+    """Rendering costs more than it tells there; landmarks localize alone."""
+    for complete, rays in ((True, 64), (False, 0)):
+        scene = replace(ground, info=replace(ground.info, complete=complete, colour_noise=noise))
+        localizer = bn.Localizer(scene, warm_up=False)
+        problem = localizer.problem(unseen().frame)
+        assert Loop([unseen()], require(localizer.matcher), problem, rays=64).rays == rays
 
 
 def test_a_map_that_is_being_changed_is_not_read(bidnerf: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -379,6 +379,7 @@ def test_view_saves_a_page_of_photos(bidnerf: Run, room: Map, tmp_path: Path) ->
     assert not page.exists()
     some = bidnerf(*place, none, "--save", page).succeed()
     assert str(none) in some.err
+    assert f"loading {room.folder}" in some.err.splitlines()
     good, bad = viewed.state_of(page.read_text())["answers"]
     assert (good["name"], good["accepted"]) == ("photo", True), good["reason"]
     assert not bad["accepted"]
