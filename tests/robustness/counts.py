@@ -1,6 +1,6 @@
 """A table of the counts of all hostile cases, by kind: how many were tried, and how many ended as they must.
 
-    python tests/robustness/counts.py [--only KIND ...] [--scale 1] [--record]
+    python tests/robustness/counts.py [--only [KIND ...]] [--scale 1] [--record]
 
 ``--record`` writes the table to benchmarks/results/robustness.json. It goes on after an interruption: a kind that has been tried at
 this commit is not tried again, and of kinds that are not asked for, the latest counts are written, with their commits.
@@ -75,7 +75,7 @@ def counted(kind: str, scale: float) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", choices=list(KINDS), default=list(KINDS), metavar="KIND")
+    parser.add_argument("--only", nargs="*", choices=list(KINDS), default=list(KINDS), metavar="KIND")
     parser.add_argument("--scale", type=float, default=1.0, help="of the random searches")
     parser.add_argument("--record", action="store_true", help="write benchmarks/results/robustness.json")
     given = parser.parse_args()
