@@ -25,12 +25,14 @@ from bidnerf_core.fields import RaySampler as RaySampler
 from bidnerf_core.fields import RaySamples as RaySamples
 from bidnerf_core.fields import SceneBounds as SceneBounds
 from bidnerf_core.fields import Stratified as Stratified
+from bidnerf_core.fields import device_of as device_of
 from bidnerf_core.fields import levels as levels
 from bidnerf_core.fields import render as render
 from bidnerf_core.fields import render_image as render_image
-from bidnerf_core.frames import View
+from bidnerf_core.frames import View as View
 from bidnerf_core.registry import Plugins, interface_defects
 from bidnerf_core.training import Report as Report
+from bidnerf_core.training import StepOutcome as StepOutcome
 from bidnerf_core.training import Supervision as Supervision
 from bidnerf_core.training import SupervisionConfig as SupervisionConfig
 

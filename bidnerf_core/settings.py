@@ -31,6 +31,9 @@ WIDEST_HFOV = 170.0
 
 LARGEST_LENGTH = 1e15
 """Largest length (metres): squares of larger lengths approach the largest single-precision number."""
+NARROWEST_HFOV = 3.0
+"""Largest horizontal field of view (degrees) that users cannot state: each of up to ``WIDEST_HFOV`` is less than this in radians."""
+
 FARTHEST = 1e9
 """Largest depth (metres) that counts as measured: no sensor reaches farther."""
 
@@ -83,6 +86,13 @@ class Above(Range):
     def __str__(self) -> str:
         least, most = _limits(self)
         return f"more than {least}" + (f", at most {most}" if most else "")
+
+
+class Angle(Above):
+    """The range of an angle in degrees."""
+
+    def __str__(self) -> str:
+        return f"{super().__str__()} degrees"
 
 
 class WholeNumbers(Range):

@@ -61,7 +61,10 @@ def run_demo(
         options = TrainOptions(DatasetOptions(background=scene.bounds.background), overwrite=True)
         with report_time(f"made a map from the {len(seen)} images"), interruptible_work(kept=stopped):
             stored = train(out / "data", backend, out / "map", config, options=options)
-        say(f"finding the poses of the {frames} others without a start (auto), and of the first from a start (bid)")
+        say(
+            f"finding the poses of the {frames} others without a start (auto, by landmarks and depth), and of the first from a start"
+            " (bid, by rendering the field)"
+        )
         localizers = {"auto": Localizer(stored), "bid": Localizer(stored, "bid", settings_of("bid", DESCENT))}
         # Far from the pose in metres, of which the lorry is nearly two long, and in degrees.
         far = perturb(unseen[0].T_ref_camera, 0.55, 13.0, seed=seed)

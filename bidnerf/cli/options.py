@@ -18,7 +18,7 @@ from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.installation import import_extra
 from bidnerf_core.io import require_existing
 from bidnerf_core.registry import USUAL_FEATURES, USUAL_METHOD, Plugins
-from bidnerf_core.settings import EXPERT, LARGEST_SEED, WIDEST_HFOV, Above, OneOf, WholeNumbers
+from bidnerf_core.settings import EXPERT, LARGEST_SEED, NARROWEST_HFOV, WIDEST_HFOV, Above, Angle, OneOf, WholeNumbers
 
 if TYPE_CHECKING:
     from bidnerf_core.camera import CameraSource, Intrinsics
@@ -213,7 +213,7 @@ class CameraOptions:
 
     focal: Annotated[float | None, Above(0.0), Option("PX", "focal length in pixels of the image file")] = None
     hfov: Annotated[
-        float | None, Above(0.0, WIDEST_HFOV), Option("DEG", "horizontal field of view of the upright image")
+        float | None, Angle(NARROWEST_HFOV, WIDEST_HFOV), Option("DEG", "horizontal field of view of the upright image")
     ] = None
 
     def __post_init__(self) -> None:

@@ -35,7 +35,8 @@ class PoseError:
 
     def __str__(self) -> str:
         shown = (
-            (float(v.median()), "median ") if v.ndim else (float(v), "") for v in (self.translation, self.rotation_deg)
+            (float(v.quantile(0.5)), "median ") if v.ndim else (float(v), "")
+            for v in (self.translation, self.rotation_deg)
         )
         return " and ".join(
             f"{note}{v:.3g} {unit}" for (v, note), unit in zip(shown, (symbol(self.unit), "deg"), strict=True)

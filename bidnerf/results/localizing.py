@@ -122,7 +122,7 @@ def _queries(localizer: Localizer | MapCollection, given: Any) -> QuerySource:
             raise InputError(
                 f"got a {type(each).__name__}",
                 where="queries",
-                expected="photos by path, or a Frame, View or list of Views for each",
+                expected="photos or a dataset by path, or a Frame, View or list of Views for each",
             )
         rigs.append(tuple(rig))
     return _Rigs(rigs)

@@ -37,13 +37,13 @@ def overlay(
         raise InputError(
             f"frame is a {type(frame).__name__}", where="overlay", expected="a Frame, such as that of a View"
         )
-    frame = frame.over(scene.bounds.background)
+    frame, caption = frame.over(scene.bounds.background), "rendered at the pose found"
     if isinstance(pose, Localization):
+        caption = caption if pose.converged else f"refused: {pose.outcome.value}"
         frame, pose = pose.frame_as_taken(frame), pose.T_world_camera
     painter = Painter(scene, frame, 640)
     T = start_pose(pose, "pose")
-    caption = "rendered at the pose found" if T.is_finite else "no pose was found"
-    rows = [painter.row(painter.observed, "observed", T, caption)]
+    rows = [painter.row(painter.observed, "observed", T, caption if T.is_finite else "no pose was found")]
     if start is not None:
         rows.append(painter.row(painter.observed, "observed", start_pose(start), "rendered at the start"))
     return np.concatenate(rows, axis=0)

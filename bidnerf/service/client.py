@@ -35,6 +35,8 @@ class ServiceClient:
     """
 
     def __init__(self, url: str = "http://127.0.0.1:8000", token: str | None = None, timeout: float = 120.0) -> None:
+        if not url.startswith(("http://", "https://")):
+            raise ServiceError(0, f"the address is {url!r}, expected http:// or https:// before it")
         self.url, self.token, self.timeout = url.rstrip("/"), token, timeout
 
     def localize(

@@ -221,12 +221,13 @@ async def _answer_error(request: Request, error: Exception) -> Response:
     if isinstance(error, Refused):
         return problem(error.status, error.detail, error.headers, **error.more)
     if isinstance(error, HTTPException):
-        headers = error.headers
+        detail, headers = f"{error.detail}; /docs describes what this service answers", error.headers
         if error.status_code == 405:  # each method of a path has its own route, which knows no other method
             path = request.scope["route"].path
             same = (route for route in request.app.routes if route.path == path)
-            headers = {"Allow": ", ".join(sorted({method for route in same for method in route.methods}))}
-        return problem(error.status_code, error.detail, headers)
+            allowed = ", ".join(sorted({method for route in same for method in route.methods}))
+            detail, headers = f"{path} does not take {request.method}, expected {allowed}", {"Allow": allowed}
+        return problem(error.status_code, detail, headers)
     return problem(400, str(error))
 
 
@@ -313,7 +314,7 @@ async def read_photo(request: Request, limits: ServiceLimits) -> Upload:
         if name == "photo" and isinstance(value, UploadFile):
             stem = PurePosixPath((value.filename or "").replace("\\", "/")).stem[:LONGEST_NAME]
         values[name] = await value.read() if isinstance(value, UploadFile) else value
-    if not values.get("photo"):
+    if not values.get("photo") and values.keys() <= PhotoForm.model_fields.keys():
         raise InputError("no photo", expected="its bytes as the body, or a form with a file 'photo'")
     if "depth_unit" in values and "depth" not in values:
         raise InputError("depth_unit was given without depth", expected="the depth image that it belongs to")

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 from bidnerf_core.errors import amount
-from bidnerf_core.geometry import scale_point
+from bidnerf_core.geometry import LengthUnit, scale_point, symbol
 from bidnerf_core.mapping import HeldOutTrial
 from bidnerf_core.settings import Coordinate, Degrees, Length, NotNegative, Range, Share, WholeNumber
 
@@ -139,16 +139,16 @@ class CaptureReport:
         )
 
 
-def summary(report: CaptureReport) -> list[str]:
+def summary(report: CaptureReport, unit: LengthUnit = "units") -> list[str]:
     """Return at most ``SUMMARY_LINES`` lines of the report; if some were left out, the last line gives their number."""
-    lines = sentences(report)
+    lines = sentences(report, unit)
     left = len(lines) - SUMMARY_LINES + 1
     more = f"{left} more remarks: 'bidnerf info' prints them all, and 'bidnerf info --plot' plots the capture"
     return lines if left <= 1 else [*lines[: SUMMARY_LINES - 1], more]
 
 
-def sentences(report: CaptureReport) -> list[str]:
-    """Return all remarks on a capture, one or two sentences per line, the most serious problems first."""
+def sentences(report: CaptureReport, unit: LengthUnit = "units") -> list[str]:
+    """Return all remarks on a capture, whose lengths are in ``unit``: one or two sentences per line, the most serious problems first."""
     covered, trial, photos = report.coverage, report.trial, amount(len(report.photos), "photo")
     low, high = covered.heights_deg
     is_outside, few = covered.arrangement in ("around", "one side"), len(report.photos) < 8
@@ -156,11 +156,14 @@ def sentences(report: CaptureReport) -> list[str]:
     if covered.arrangement == "inside":
         heights = f", looking {low:.0f}° to {high:.0f}° up"
     landmarks = (
-        f"{covered.landmarks} landmarks in several photos, typically {covered.seen_by:.0f} within {covered.seen_within_deg:.0f}°"
+        f"{covered.landmarks} landmarks in several photos, typically in {covered.seen_by:.0f}, which see it from directions within"
+        f" {covered.seen_within_deg:.0f}°"
         if covered.landmarks
         else "no landmark seen by several of them could be triangulated"
     )
-    errors = f", median error {trial.translation:.3g} and {trial.rotation_deg:.2g}°" if trial.found else ""
+    errors = (
+        f", median error {trial.translation:.3g} {symbol(unit)} and {trial.rotation_deg:.2g}°" if trial.found else ""
+    )
     remarks = [
         (True, f"{photos}, {ARRANGEMENTS[covered.arrangement]}{heights}; {landmarks}"),
         (

@@ -183,7 +183,10 @@ def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> 
         return
     remedy = "check the unit of the depth images (depth_unit_scale_factor in a transforms.json)"
     if depth_unit is not None:
+        # Sensors count in round steps, such as 1 mm or 0.2 mm, and the ratio is known to some percent.
         right = depth_unit / ratio
+        rounded = float(f"{right:.1g}")
+        right = rounded if abs(rounded / right - 1) < 0.05 else right
         remedy = (
             f"if the poses are in metres, a step of the depth images is {right:.3g} m and not {depth_unit:.3g} m (`depth_unit`"
             f" {right:.3g}, or depth_unit_scale_factor in a transforms.json)"

@@ -295,7 +295,7 @@ class Capture:
             inside = [index for index, shot in enumerate(self.shots) if split in shot.splits]
             for index, name in zip(inside, self.frame_names(split), strict=True):
                 own[index].append(name)
-        folder.require_any([name for names in own for name in names])
+        folder.require_any(list(dict.fromkeys(name for names in own for name in names)))
         files = [next((file for name in names if (file := folder.file_of(name))), None) for names in own]
         return replace(
             self,

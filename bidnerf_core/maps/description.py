@@ -129,7 +129,10 @@ class MapInfo:
             return None
         if not self.step:
             return "the training of its field has not begun; 'bidnerf train DATA --out MAP --resume' begins it"
-        return f"its training stopped at step {self.step}; 'bidnerf train DATA --out MAP --resume' continues it"
+        return (
+            f"its training has not ended (step {self.step} is saved); 'bidnerf train DATA --out MAP --resume' continues it,"
+            " and --finish ends it as it is"
+        )
 
     def scaled(self, factor: float, unit: LengthUnit) -> MapInfo:
         """Return the description of the map scaled by ``factor``, with lengths in ``unit``; the weights keep the unit of training."""

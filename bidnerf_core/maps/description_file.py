@@ -23,7 +23,10 @@ def read_description(folder: Path) -> dict[str, Any]:
             expected="a map: a folder as written by 'bidnerf train'",
         )
     if not path.exists():
-        raise InputError(f"no {DESCRIPTION} found", where=folder, expected="a map as written by 'bidnerf train'")
+        inside = "".join(f", such as {map} in it" for map in maps_in(folder)[:1])
+        raise InputError(
+            f"no {DESCRIPTION} found", where=folder, expected=f"a map as written by 'bidnerf train'{inside}"
+        )
     found = read_json(path, "the description of a map")
     if not isinstance(found, dict) or found.get("format") != "bidnerf map":
         raise InputError("not the description of a map", where=path, expected='"format": "bidnerf map"')

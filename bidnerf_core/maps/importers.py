@@ -82,6 +82,8 @@ class Importer(Protocol):
 
         Raises ``InputError`` for a damaged file, before memory is allocated for data that it only declares,
         and for a placement that this kind of field does not support. Code in a file is never run.
+
+        An importer of posed images also takes ``image_folder``, the folder of the images if the user names one, else None.
         """
         ...
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import math
 import os
 import warnings
@@ -103,11 +104,18 @@ def import_map(
     if any(origin):
         T = T.translated(-torch.tensor(origin, dtype=torch.float64))
     folder, device, where = None if out is None else Path(out), working_device(options.device), str(path)
+    images_at, of_images = options.images.image_folder, dict[str, Any]()
+    if "image_folder" in inspect.signature(chosen.read).parameters:
+        of_images["image_folder"] = images_at
+    elif images_at is not None and photos is None:
+        raise InputError(
+            "`images` names a folder, but no dataset that lists its images;", where=where, expected="`photos`"
+        )
     with (
         job_context(progress, cancel),
         contextlib.nullcontext() if folder is None else map_folder(folder, options.overwrite),
     ):
-        found = chosen.read(path, settings, Similarity(scale, T))
+        found = chosen.read(path, settings, Similarity(scale, T), **of_images)
         for line in found.found:
             log.info(f"{where}: {line}")
         if found.structure is not None:
@@ -188,6 +196,8 @@ def _of_structure(found: ImportedField, structure: Structure, options: ImportOpt
     if structure.keypoints:
         read, tracked = _stored_views(structure, features, origin)
     else:
+        masks = options.images.mask_folder
+        capture = capture if masks is None else capture.with_masks(masks)
         read = read_views(capture, replace(options.images, split="all")).about(origin)
     bounds = bounds_about(structure.positions[structure.positions.isfinite().all(-1)] + offset)
     _report_extent(found, str(capture.path), unit)

@@ -399,7 +399,7 @@ class Map:
         if landmarks is not None:
             landmarks = replace(landmarks, trial=tried_field(scene, views, landmarks.trial))
         capture = survey_capture(tracked, views, trial=None if landmarks is None else landmarks.trial, up=self.up)
-        for line in summary(capture):
+        for line in summary(capture, self.unit):
             log.info(line)
         return scene.with_parts(None, landmarks, capture)
 

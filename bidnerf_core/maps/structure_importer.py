@@ -47,9 +47,11 @@ class StructureImporter:
         """Return whether a folder is a COLMAP project or contains a COLMAP model."""
         return path.is_dir() and bool(colmap_models(path))
 
-    def read(self, path: Path, config: StructureSettings, placement: Similarity) -> ImportedField:
+    def read(
+        self, path: Path, config: StructureSettings, placement: Similarity, image_folder: Path | None = None
+    ) -> ImportedField:
         """Read the COLMAP model in a folder; see ``Importer.read``."""
-        model, folder, images, cameras, files = colmap_project(path)
+        model, folder, images, cameras, files = colmap_project(path, image_folder)
         _, points = read_model(model)
         found = [f"{model}: {amount(len(images), 'image')}, {amount(len(points.ids), 'point')}"]
         shots = [shot_of(model, image, files.get(image.name), cameras) for image in images]
@@ -74,7 +76,7 @@ class StructureImporter:
             if known and image.name not in known:
                 left_out.append(f"{image.name}: it has no keypoints in the file of them")
             elif not known and image.name not in files:
-                left_out.append(f"{image.name}: no such photo in {folder}")
+                left_out.append(f"{image.name}: no such photo in {folder} (`images` names another folder)")
             elif int((observed[number] >= 0).sum()) < 6:  # too few to determine even its own pose by RANSAC
                 left_out.append(f"{image.name}: it observes fewer than 6 points")
             else:

@@ -78,11 +78,12 @@ class MapSummary:
             "capture": capture,
         }
         poses = [] if refinement is None else pose_sentences(info.cameras, refinement)
-        return MapSummary(info, facts, (*poses, *([] if capture is None else sentences(capture))))
+        return MapSummary(info, facts, (*poses, *([] if capture is None else sentences(capture, info.unit))))
 
     def plain(self) -> dict[str, Any]:
         """Return the facts as JSON-serializable values."""
-        return cast(dict[str, Any], to_plain({name: getattr(self.info, name) for name in DESCRIBED} | self.facts))
+        described = {name: getattr(self.info, name) for name in DESCRIBED} | {"backend": self.info.backend or None}
+        return cast(dict[str, Any], to_plain(described | self.facts))
 
     def __str__(self) -> str:
         info, facts, bounds = self.info, self.facts, self.info.bounds
@@ -97,7 +98,8 @@ class MapSummary:
             state = (
                 "complete" if info.complete else "not complete; 'bidnerf train DATA --out MAP --resume' continues it"
             )
-            training = f"{info.step} steps of backend {info.backend} in {duration_text(info.seconds)}, {state}"
+            trained = f"{amount(info.step, 'step')} of backend {info.backend} in {duration_text(info.seconds)}, {state}"
+            training = trained if info.seconds else f"none here: imported as a field of backend {info.backend}"
             field = f"{amount(facts['parameters'], 'parameter')} in {amount(facts['levels'], 'level')}"
             if info.colour_noise is not None:
                 field += f", off by {info.colour_noise:.1%} of the range of colours on its training images (RMS)"

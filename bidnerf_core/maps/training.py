@@ -456,7 +456,8 @@ def train_field(
         )
         raise Cancelled(f"{where}: {outcome} after step {stopped.step}{advice}") from stopped
     report.finish(field)
-    log.info(f"{where}: field trained for {amount(report.info.step, 'step')}, {duration_text(report.info.seconds)}")
+    steps, seconds = report.info.step - scene.info.step, report.info.seconds - scene.info.seconds
+    log.info(f"{where}: field trained for {amount(steps, 'step')}, {duration_text(seconds)}")
     frozen = build_frozen_field(report.info, pack_tensors(cast(nn.Module, field).state_dict()), out)
     return Map(report.info, frozen, None, scene.landmarks, out, scene.record).to(device)
 

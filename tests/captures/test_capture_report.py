@@ -31,7 +31,7 @@ from bidnerf_core.captures.report import SUMMARY_LINES
 from bidnerf_core.captures.survey import groups
 from bidnerf_core.fields import Stratified, render_image
 from bidnerf_core.geometry import look_at
-from bidnerf_core.mapping import track_views
+from bidnerf_core.mapping import HeldOutTrial, track_views
 from bidnerf_core.training import photo_measures
 from landmark_scene import Points, looking_in, ring
 from optional import require
@@ -252,6 +252,12 @@ def test_the_exposure_of_a_photo_without_landmarks_is_unknown() -> None:
 def test_exposure_that_varies_by_more_than_a_stop_is_remarked(stops: float, remarked: bool) -> None:
     lines = sentences(CaptureReport((), CoverageRecord(), exposure_range=stops))
     assert any("exposure varies" in line for line in lines) is remarked
+
+
+def test_the_errors_of_a_map_are_in_its_unit() -> None:
+    report = CaptureReport((), CoverageRecord(), trial=HeldOutTrial(9, 8, 0.00275, 0.034))
+    for unit, shown in (("metres", "median error 0.00275 m and 0.034°"), ("units", "0.00275 units and")):
+        assert any(shown in line for line in sentences(report, unit))
 
 
 def test_groups_are_numbered_by_size() -> None:

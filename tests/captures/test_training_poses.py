@@ -177,7 +177,7 @@ def test_depth_in_another_unit_is_refused(ratio: float) -> None:
 
 
 def test_another_unit_of_depth_is_named_where_it_can_be_given() -> None:
-    for ratio, unit, better in ((0.2, 1 / 5000, "0.001"), (0.3048, 0.001, "0.00328")):
+    for ratio, unit, better in ((0.2, 1 / 5000, "0.001"), (0.198, 1 / 5000, "0.001"), (0.3048, 0.001, "0.00328")):
         with pytest.raises(InputError, match=rf"times .*`depth_unit` {re.escape(better)}, "):
             check_depth_unit(measured(ratio), unit)
 

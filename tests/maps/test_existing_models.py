@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import bidnerf as bn
 import tiny
@@ -152,6 +153,7 @@ def test_a_model_becomes_a_map_of_landmarks_in_its_own_frame(
     scene = bn.load_map(folder)
     assert not scene.has_field
     assert "landmarks alone localize photos" in str(scene.describe())
+    assert scene.describe().plain()["backend"] is None
     assert [camera.name for camera in scene.info.cameras] == [f"{number:03d}" for number in range(COUNT)]
     assert [camera.file for camera in scene.info.cameras] == [f"images/{n:03d}.png" for n in range(COUNT)]
     for camera, T in zip(scene.info.cameras, model.poses, strict=True):
@@ -302,6 +304,24 @@ def test_each_photo_that_is_left_out_has_a_reason(model: Model, caplog: pytest.L
     assert len(scene.info.cameras) == COUNT - 2
     assert "left out: 003.png: no such photo" in caplog.text
     assert "left out: 005.png: it observes fewer than 6 points" in caplog.text
+
+
+def test_photos_elsewhere_are_named_as_of_any_dataset(model: Model, tmp_path: Path) -> None:
+    photos, masks = tmp_path / "photos", tmp_path / "masks"
+    (model.folder / "images").rename(photos)
+    with refused(found="no such photo in ", where=model.folder / "sparse") as caught:
+        bn.import_map(model.folder / "sparse", bake=False)
+    assert "(`images` names another folder)" in str(caught.error)
+    masks.mkdir()
+    Image.fromarray(np.zeros((CAMERA.height, CAMERA.width), dtype=np.uint8)).save(masks / "000.png")
+    given = bn.ImportOptions(bn.DatasetOptions(images=photos, masks=masks))
+    scene = bn.import_map(model.folder / "sparse", bake=False, options=given)
+    assert [camera.name for camera in scene.info.cameras] == [f"{number:03d}" for number in range(1, COUNT)]
+    (masks / "000.png").rename(masks / "other.png")
+    with refused(where=masks, found=f"no mask in it matches any of {COUNT} images"):
+        bn.import_map(model.folder / "sparse", bake=False, options=given)
+    with refused(found=f"no such photo in {masks}"):
+        bn.import_map(model.folder, options=bn.ImportOptions(bn.DatasetOptions(images=masks)))
 
 
 def test_an_import_leaves_a_whole_map_or_nothing(model: Model, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

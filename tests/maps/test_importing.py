@@ -16,7 +16,7 @@ from bidnerf import import_map, load_map
 from bidnerf.cli import main
 from bidnerf.scenes import demo_object
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.datasets import write_transforms
+from bidnerf_core.datasets import DatasetOptions, write_transforms
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.fields import FieldValues, RayHits, Rays, SceneBounds, Stratified
 from bidnerf_core.geometry import SE3, Similarity
@@ -84,6 +84,11 @@ def test_a_file_becomes_a_map(file: Path, tmp_path: Path, caplog: pytest.LogCapt
     assert scene.unit == "units"
     assert f"{FEW} viewpoints" in caplog.text
     again = load_map(tmp_path / "MAP")
+    assert "training:    none here: imported as a field of backend hashgrid" in str(again.describe())
+    with refused(where=tmp_path, expected=f"such as {tmp_path / 'MAP'} in it"):
+        load_map(tmp_path)
+    with refused(where=file, found="`images` names a folder, but no dataset", expected="`photos`"):
+        import_map(file, bake=False, options=ImportOptions(DatasetOptions(images=tmp_path)))
     assert again.info.complete
     assert again.info.data == "field.tiny"
     assert again.info.cameras == scene.info.cameras

@@ -177,7 +177,7 @@ def test_a_factor_is_a_positive_number(ground: Map, factor: float) -> None:
 
 
 def test_an_interrupted_training_is_not_scaled(ground: Map) -> None:
-    with refused(where="data", found="cannot be scaled: its training stopped at step 1"):
+    with refused(where="data", found="cannot be scaled: its training has not ended (step 1 is saved)"):
         replace(ground, info=replace(ground.info, complete=False)).scaled(2)
 
 

@@ -38,6 +38,10 @@ def trace(translation: list[float], rotation_deg: list[float] | None = None) -> 
     return PoseError(far, torch.zeros_like(far) if rotation_deg is None else far.new_tensor(rotation_deg))
 
 
+def test_the_median_of_an_even_number_of_errors_is_between_the_middle_ones() -> None:
+    assert str(trace([1.0, 2.0, 4.0, 9.0])) == "median 3 units and median 0 deg"
+
+
 @given(tangents, tangents)
 def test_error_agrees_with_scipy(a: torch.Tensor, b: torch.Tensor) -> None:
     one, two = SE3.exp(a), SE3.exp(b)

@@ -32,6 +32,7 @@ from bidnerf.results import (
 from bidnerf.testing import textured_map
 from bidnerf_core.datasets import write_transforms
 from bidnerf_core.frames import View
+from bidnerf_core.localization import Verdict
 from bidnerf_core.progress import Progress
 from drawn import record
 from flights import covered, flight
@@ -108,6 +109,12 @@ def test_an_overlay_shows_photo_rendering_and_both(folder: Path) -> None:
         rgb=torch.zeros((10, 800, 3)), depth=None, intrinsics=bn.Intrinsics(400.0, 400.0, 400.0, 5.0, 800, 10)
     )
     assert overlay(scene(), wide, T).shape[1] // 3 // 10 == 64  # a tile has 640 pixels of the photo
+    answer = bn.localize(scene(), frame).answers[0].localization
+    assert answer.converged
+    accepted, rejected = (
+        overlay(scene(), frame, found) for found in (answer, answer.rejected(Verdict(Outcome.AMBIGUOUS, "")))
+    )
+    assert not np.array_equal(accepted, rejected)  # only a caption differs
 
 
 def test_an_answer_that_found_nothing_has_no_pose() -> None:

@@ -374,7 +374,8 @@ def test_what_is_missing_is_named(service: Service, inputs: Inputs) -> None:
         (f"map=map&focal={'9' * 5000}", "focal is", "a number up to"),
         (f"map=map&seed={'9' * 5000}", "seed is"),
         ("map=map&hfov=179.9", "expected a number up to 170"),
-        ("map=map&hfov=0", "expected a number above 0"),
+        ("map=map&hfov=1.18", "expected a number above 3"),
+        ("image=photo.png", 'unknown parameter "image", expected any of', "photo"),
         ("map=map&focal=0.001", "focal is 0.001 for 24 columns, expected at least 1.05"),
     ):
         detail = service.post(f"/localize?{query}", inputs.photo).json["detail"]
@@ -382,6 +383,11 @@ def test_what_is_missing_is_named(service: Service, inputs: Inputs) -> None:
     assert service.post("/localize?map=map").json["detail"].startswith("no photo, expected")
     refused = service.get("/localize")
     assert (refused.status, refused.headers["allow"]) == (405, "POST")
+    assert refused.json["detail"] == "/localize does not take GET, expected POST"
+    misspelt = service.post("/localize", form(image=inputs.photo), FORM)
+    assert misspelt.json["detail"].startswith('unknown parameter "image", expected any of map, name,')
+    with pytest.raises(ServiceError, match="the address is '127\\.0\\.0\\.1:8765', expected http:// or"):
+        ServiceClient("127.0.0.1:8765")
     for path in ("/nothing", "/maps/", "/maps/nothing", "/maps/nothing/localize/"):
         assert service.get(path).json["status"] == 404, path
     for number in ("1_0", "\u0663", " 5", "infinity", "0x10"):

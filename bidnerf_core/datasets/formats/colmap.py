@@ -164,7 +164,7 @@ def _image_folder(
     If none of the usual folders holds half of the images, they are looked for below ``path``, or in the ``given`` folder alone.
     """
     usual = (model.parent / "images", model.parent.parent / "images", *map(path.joinpath, IMAGE_FOLDERS))
-    best: tuple[Path, dict[str, Path]] = (path / IMAGE_FOLDERS[0], {})
+    best: tuple[Path, dict[str, Path]] = (given or path / IMAGE_FOLDERS[0], {})
     for folder in filter(Path.is_dir, dict.fromkeys(usual) if given is None else ()):
         names = FileNames(folder)
         files = {image.name: file for image in images if (file := names.find(posix_name(image.name))) is not None}

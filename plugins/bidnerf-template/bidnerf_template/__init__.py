@@ -9,9 +9,17 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.nn import functional
 
-from bidnerf_core.fields import FieldValues, SceneBounds, Stratified, device_of
-from bidnerf_core.frames import View
-from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig
+from bidnerf_core.backend import (
+    FieldValues,
+    Report,
+    SceneBounds,
+    StepOutcome,
+    Stratified,
+    Supervision,
+    SupervisionConfig,
+    View,
+    device_of,
+)
 
 __all__ = ["TemplateBackend", "TemplateConfig", "TemplateField", "backend"]
 
