@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from bidnerf.cli.options import (
     NEW_POSES,
-    POSES,
+    POSE_FILE,
     MethodGroup,
     Queries,
     QueryImages,
@@ -88,7 +88,7 @@ class StartOptions:
 class AnswerOutput(RunOptions):
     """Where answers are computed, and where they are written."""
 
-    out: Annotated[Path | None, POSES, NEW_POSES] = None
+    out: Annotated[Path | None, POSE_FILE, NEW_POSES] = None
     draw: Annotated[Path | None, Option("DIR", "draw each photo next to the map rendered from the pose found")] = None
 
     def check(self, inputs: Sequence[Path]) -> None:

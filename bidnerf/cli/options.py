@@ -74,7 +74,7 @@ Seed: TypeAlias = Annotated[int, WholeNumbers(0, LARGEST_SEED), Option("N", "see
 Json: TypeAlias = Annotated[bool, FLAG, Option(None, "print JSON, one value per line")]
 First: TypeAlias = Annotated[int | None, WholeNumbers(1), Option("N", "use only the first N images", "all")]
 NoDepth: TypeAlias = Annotated[bool, FLAG, EXPERT, Option(None, "leave out measured depth")]
-POSES = Option(
+POSE_FILE = Option(
     "POSES",
     lambda: (
         "write the poses to this file, in the format of its ending:"

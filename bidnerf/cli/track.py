@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from bidnerf.cli.options import (
     NEW_POSES,
-    POSES,
+    POSE_FILE,
     CameraOptions,
     First,
     MapFolder,
@@ -80,7 +80,7 @@ def run_track(
         Option("SEQUENCE", "folder of a dataset or images, or a video", positional=True),
         existing("a dataset, images or a video"),
     ],
-    out: Annotated[Path, POSES, NEW_POSES],
+    out: Annotated[Path, POSE_FILE, NEW_POSES],
     plot: Annotated[Path | None, Option("PNG", "draw the path over the map's surface, coloured by uncertainty")] = None,
     *,
     run: RunOptions,
