@@ -131,7 +131,7 @@ class MapInfo:
             return "the training of its field has not begun; 'bidnerf train DATA --out MAP --resume' begins it"
         return (
             f"its training has not ended (step {self.step} is saved); 'bidnerf train DATA --out MAP --resume' continues it,"
-            " and --finish ends it as it is"
+            " and 'bidnerf train DATA --out MAP --finish' ends it as it is"
         )
 
     def scaled(self, factor: float, unit: LengthUnit) -> MapInfo:

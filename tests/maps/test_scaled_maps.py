@@ -14,7 +14,6 @@ import tiny
 from bidnerf.results import read_positions
 from bidnerf.testing import BOUNDS, GROUND_CAMERA, textured_map, unseen
 from bidnerf_core.captures import stored_cameras
-from bidnerf_core.captures.cameras import record_refinement
 from bidnerf_core.fields import levels
 from bidnerf_core.io import FileInUse, lock
 from bidnerf_core.localization import Loop
@@ -120,7 +119,8 @@ def test_images_in_the_unit_of_before_are_scaled_as_their_map_was(origin: tuple[
     moves = torch.eye(3, 6, dtype=torch.float64)
     given = [bn.View(view.frame.replace(name=f"c{n}"), view.T_ref_camera.retract(move)) for n, move in enumerate(moves)]
     refined = [replace(v, T_ref_camera=v.T_ref_camera.retract(0.01 * moves[0])) for v in given]
-    cameras = record_refinement(given, stored_cameras(refined), [1.0, 1.0, 1.0])
+    both = zip(stored_cameras(given), stored_cameras(refined), strict=True)
+    cameras = tuple(replace(after, given_T_world_camera=before.T_world_camera) for before, after in both)
     info = MapInfo("ground", {}, BOUNDS, 1, True, "data", weights="ground", cameras=cameras, origin=origin)
     in_world = [replace(v, T_ref_camera=v.T_ref_camera.translated(offset)) for v in given]
     large = info.scaled(2.5, "metres")
