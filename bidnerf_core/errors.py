@@ -68,7 +68,9 @@ def unknown_name(what: str, name: str, known: Collection[str]) -> InputError:
 
 def spelling_hint(name: str, known: Collection[str], otherwise: str = "") -> str:
     """Return ``, did you mean 'NAME'?`` with the closest name in ``known``, or ``otherwise`` if none is similar."""
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.7)
+    # The first letter is rarely mistyped, and names that differ in it are rarely meant.
+    alike = [other for other in known if other.lstrip("-")[:1] == name.lstrip("-")[:1]]
+    near = difflib.get_close_matches(name, alike, n=1)
     return f", did you mean {near[0]!r}?" if near else otherwise
 
 
