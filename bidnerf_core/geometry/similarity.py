@@ -135,7 +135,8 @@ def fit_similarity(
         raise InputError(f"a point is {largest:g} away from the origin", expected=f"at most {FARTHEST_CAMERA:g}")
     if len(source) < 2 or spread(source) == 0 or spread(target) == 0:
         raise InputError(f"{len(source)} pairs of points", expected="2 or more distinct ones")
-    share = torch.full((len(source), 1), 1 / len(source)) if weights is None else (weights / weights.sum())[:, None]
+    weights = torch.ones_like(source[:, 0]) if weights is None else weights
+    share = (weights / weights.sum())[:, None]
     source_mean, target_mean = (share * source).sum(0), (share * target).sum(0)
     from_mean, to_mean = source - source_mean, target - target_mean
     u, values, vh = torch.linalg.svd(to_mean.mT @ (share * from_mean))  # eqs. 38, 39
