@@ -69,7 +69,7 @@ def unknown_name(what: str, name: str, known: Collection[str]) -> InputError:
 def spelling_hint(name: str, known: Collection[str], otherwise: str = "") -> str:
     """Return ``, did you mean 'NAME'?`` with the closest name in ``known``, or ``otherwise`` if none is similar."""
     # The first letter is rarely mistyped, and names that differ in it are rarely meant.
-    alike = [other for other in known if other.lstrip("-")[:1] == name.lstrip("-")[:1]]
+    alike = [other for other in known if other.lstrip("-")[:1].lower() == name.lstrip("-")[:1].lower()]
     near = difflib.get_close_matches(name, alike, n=1)
     return f", did you mean {near[0]!r}?" if near else otherwise
 

@@ -26,7 +26,7 @@ def run_demo(
         str, installed("backends"), Option("NAME", "kind of field, one of 'bidnerf backends'")
     ] = USUAL_BACKEND,
     out: Annotated[Path, Option("DIR", "folder for the map, the images and the pictures")] = Path("demo-out"),
-    frames: Annotated[int, WholeNumbers(1), Option("N", "number of unseen frames to localize")] = 4,
+    frames: Annotated[int, WholeNumbers(1), EXPERT, Option("N", "number of unseen frames to localize")] = 4,
     steps: Annotated[int | None, WholeNumbers(1), Option("N", "training steps", "the backend's quick choice")] = None,
     seed: Annotated[Seed, EXPERT] = 0,
     overwrite: Overwrite = False,

@@ -213,7 +213,7 @@ def run_compare(
             expected="the folders of one or more maps, then that of a dataset",
         )
     *maps, data = folders
-    require_existing(data, expected="the folder of a dataset, after those of the maps")
+    existing("the folder of a dataset, after those of the maps").function(data)
     for map in maps:
         require_map(map)
     if out is not None:

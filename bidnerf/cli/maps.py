@@ -307,6 +307,7 @@ def run_extend(
     steps: Annotated[
         int | None,
         WholeNumbers(1),
+        EXPERT,
         Option("N", "training steps", "in proportion to the new photos, at least a quarter of the usual number"),
     ] = None,
     *,

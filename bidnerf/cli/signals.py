@@ -63,15 +63,17 @@ def interruptions() -> Iterator[None]:
     usual, handler = (signal.SIG_DFL, signal.default_int_handler), Handler()
     handled = [number for number in STOP_SIGNALS if in_main and signal.getsignal(number) in usual]
     before = {number: signal.signal(number, handler) for number in handled}
-    usual_hook = sys.unraisablehook
+    usual_hook, timers = sys.unraisablehook, list[threading.Timer]()
 
     def raise_again(unraisable: Any) -> None:
         if isinstance(unraisable.exc_value, Interrupted):
-            threading.Timer(0.01, interrupt_main, [unraisable.exc_value.number]).start()
+            timers.append(threading.Timer(0.01, interrupt_main, [unraisable.exc_value.number]))
+            timers[-1].start()
         else:
             usual_hook(unraisable)
 
-    sys.unraisablehook = raise_again
+    if in_main:
+        sys.unraisablehook = raise_again
     try:
         yield
     except Exception as error:
@@ -79,9 +81,14 @@ def interruptions() -> Iterator[None]:
             raise
         raise Interrupted(handler.raised) from error
     finally:
-        sys.unraisablehook = usual_hook
-        for number, handler_before in before.items():
-            signal.signal(number, handler_before)
+        try:
+            for timer in timers:  # an interruption that is still to come is raised here
+                timer.join()
+        finally:
+            if in_main:
+                sys.unraisablehook = usual_hook
+            for number, handler_before in before.items():
+                signal.signal(number, handler_before)
 
 
 def installed_handler() -> Handler:

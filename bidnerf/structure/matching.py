@@ -27,7 +27,8 @@ EXHAUSTIVE = 60
 NEIGHBOURS = 10
 """Number of photos before and after each photo, in order of name or time, that are its candidates."""
 SIMILAR_PHOTOS, NEAR_PHOTOS = 60, 20
-"""Number of photos with the most similar descriptors, and of the nearest photos by GPS or known poses, that are a photo's candidates."""
+"""Number of photos with the most similar descriptors, and of photos near it by GPS or known poses, the nearest and
+every third of those farther away, that are a photo's candidates."""
 VOTING_KEYPOINTS = 500
 """Number of a photo's largest keypoints that vote for its candidates. They stay visible when the distance changes."""
 PARTNERS = 12

@@ -59,17 +59,17 @@ def reconstruct(database: Path, folder: Path, photos: PhotoSet, threads: int, py
     models = list[Any]()
     if total >= MANY_PHOTOS and is_known and photos.fixed in (set(), photos.known_focal):
         together = partial(_place_together, database, photos, threads, pycolmap)
-        models = _stored(folder / "together", together, pycolmap)
+        models = _load_or_make(folder / "together", together, pycolmap)
     if not models or models[0].num_reg_images() < ENOUGH_PLACED * total:
-        singly = _stored(folder / "singly", partial(_place_singly, database, total, options, pycolmap), pycolmap)
+        singly = _load_or_make(folder / "singly", partial(_place_singly, database, total, options, pycolmap), pycolmap)
         models = max(models, singly, key=lambda each: each[0].num_reg_images() if each else 0)
     if len(models) > 1:
-        apart = models
-        models = _stored(folder / "joined", lambda into: join(apart, database, into, options, pycolmap), pycolmap)
+        parts = models
+        models = _load_or_make(folder / "joined", lambda into: join(parts, database, into, options, pycolmap), pycolmap)
     return models
 
 
-def _stored(folder: Path, write: Callable[[Path], Any], pycolmap: Any) -> list[Any]:
+def _load_or_make(folder: Path, write: Callable[[Path], Any], pycolmap: Any) -> list[Any]:
     """Return the models in a folder, the largest first, without photos that see too little of them; ``write`` makes them if there is none."""
     if not folder.exists():
         unfinished = folder.with_suffix(".part")

@@ -93,7 +93,14 @@ def find_poses(
     pycolmap = import_pycolmap(str(source))
     images = photos_of(source, folder, camera)
     files = [shot.file for shot in images.shots if shot.file is not None]
-    inputs = digest(files or [source], camera)
+    inputs = digest(files or [source], camera, known or {})
+    names = {shot.name for shot in images.shots}
+    if known and files and not names & known.keys():
+        raise InputError(
+            f"known has none of the {len(names)} photos, such as {min(names)!r}",
+            where=source,
+            expected="poses by name of a photo",
+        )
     if reuse or not overwrite:
         with contextlib.suppress(*([InputError] if overwrite else [])):  # a damaged record is replaced
             record = read_pose_record(folder)

@@ -7,7 +7,7 @@ import hashlib
 import json
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from bidnerf.structure.colmap import DETECTOR
 from bidnerf.structure.gps import GeoFrame
 from bidnerf_core.camera import Camera, CameraSource, Intrinsics
 from bidnerf_core.errors import InputError, amount
+from bidnerf_core.geometry import SE3
 from bidnerf_core.io import from_plain, read_json, write_file
 
 RECORD, TRANSFORMS, WORK, MODEL, FRAMES = "poses.json", "transforms.json", "work", "sparse/0", "images"
@@ -98,10 +99,12 @@ class FoundPoses:
         return "\n".join(filter(None, lines))
 
 
-def digest(files: Sequence[Path], camera: Camera | CameraSource | str | Path | None) -> str:
-    """Return a digest of the photos and of the settings with which their poses are estimated."""
+def digest(files: Sequence[Path], camera: Camera | CameraSource | str | Path | None, known: Mapping[str, SE3]) -> str:
+    """Return a digest of the photos, of the settings with which their poses are estimated, and of poses that are ``known``."""
     identities = [[str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
-    settings = [repr(camera) if isinstance(camera, Intrinsics) else str(camera), repr(DETECTOR)]
+    settings: list[Any] = [repr(camera) if isinstance(camera, Intrinsics) else str(camera), repr(DETECTOR)]
+    if known:
+        settings.append({name: T.matrix().tolist() for name, T in sorted(known.items())})
     return hashlib.blake2b(json.dumps([identities, settings]).encode(), digest_size=16).hexdigest()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import warnings
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -195,17 +196,16 @@ def apply_stored_poses(views: Sequence[View], cameras: Sequence[StoredCamera]) -
 
     Views whose pose was not refined are returned unchanged.
     """
-    known, applied = {camera.name: camera for camera in cameras if camera.given_T_world_camera}, list[View]()
+    refined, applied = defaultdict[str, list[tuple[Tensor, StoredCamera]]](list), list[View]()
+    for camera in cameras:
+        if camera.given_T_world_camera:
+            refined[camera.name].append((_pose(camera.given_T_world_camera).matrix(), camera))
     for view in views:
-        camera = known.get(view.frame.name)
-        given = None if camera is None else camera.given_T_world_camera
-        if (
-            camera is not None
-            and given
-            and torch.allclose(_pose(given).matrix(), view.T_ref_camera.matrix(), 1e-6, 1e-6)
-        ):
-            motion = None if camera.motion is None else torch.tensor(camera.motion, dtype=torch.float64)
-            view = replace(view, T_ref_camera=camera.pose, motion=motion)
+        own = view.T_ref_camera.matrix()
+        same = (camera for given, camera in refined[view.frame.name] if torch.allclose(given, own, 1e-9, 1e-9))
+        if (known := next(same, None)) is not None and not torch.equal(own, known.pose.matrix()):
+            motion = None if known.motion is None else torch.tensor(known.motion, dtype=torch.float64)
+            view = replace(view, T_ref_camera=known.pose, motion=motion)
         applied.append(view)
     return applied
 

@@ -30,7 +30,6 @@ from bidnerf_core.datasets import (
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.fields import NoField, device_of, render_image, trained_field
 from bidnerf_core.frames import Frame, SeenLandmarks, View
-from bidnerf_core.geometry import SE3
 from bidnerf_core.io import from_plain, lock, to_plain
 from bidnerf_core.localization import Outcome
 from bidnerf_core.mapping import (
@@ -47,7 +46,7 @@ from bidnerf_core.maps.map import USUAL_BAKE, Map, load_map
 from bidnerf_core.maps.scene import landmark_cameras
 from bidnerf_core.maps.store import with_tracks_in
 from bidnerf_core.maps.training import TrainOptions, train_field
-from bidnerf_core.maps.views import ViewSource, views_again
+from bidnerf_core.maps.views import ViewSource, scaled_view, views_again
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context, log
 
 NewPhotos: TypeAlias = Sequence[Frame] | Sequence[View] | Capture | str | Path
@@ -291,21 +290,7 @@ def _train_further(scene: Map, views: Sequence[View], steps: int | None, share: 
     if not isinstance(field, nn.Module):
         raise InputError(f"the map's field is a {type(field).__name__}", expected="an nn.Module of a backend")
     if info.field_frame is not None:
-        factor = 1 / info.field_frame.scale
-        views = [
-            replace(
-                view,
-                frame=view.frame if view.frame.depth is None else view.frame.replace(depth=view.frame.depth * factor),
-                T_ref_camera=SE3(view.T_ref_camera.rotation, view.T_ref_camera.translation * factor),
-                landmarks=view.landmarks
-                and replace(
-                    view.landmarks,
-                    distance=view.landmarks.distance * factor,
-                    deviation=view.landmarks.deviation * factor,
-                ),
-            )
-            for view in views
-        ]
+        views = [scaled_view(view, 1 / info.field_frame.scale) for view in views]
     grown = train_field(
         views,
         Map(replace(info, step=0, complete=False, config=to_plain(settings, "config")), NoField()),

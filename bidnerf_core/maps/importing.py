@@ -104,6 +104,7 @@ def import_map(
     if any(origin):
         T = T.translated(-torch.tensor(origin, dtype=torch.float64))
     folder, device, where = None if out is None else Path(out), working_device(options.device), str(path)
+    options.images.require_files()
     images_at, of_images = options.images.image_folder, dict[str, Any]()
     if "image_folder" in inspect.signature(chosen.read).parameters:
         of_images["image_folder"] = images_at
@@ -193,6 +194,12 @@ def _of_structure(found: ImportedField, structure: Structure, options: ImportOpt
     offset = -torch.tensor(origin, dtype=torch.float64)
     unit: LengthUnit = "metres" if options.scale != 1 else "units"
     tracked = None
+    if structure.keypoints and options.images.masks is not None:
+        raise InputError(
+            "masks do not apply to stored keypoints",
+            where=capture.path,
+            expected="none, or the keypoints of photos (`keypoints` 'photos')",
+        )
     if structure.keypoints:
         read, tracked = _stored_views(structure, features, origin)
     else:

@@ -42,7 +42,7 @@ from bidnerf_core.localization import (
     rig,
     settings_of,
 )
-from bidnerf_core.maps.map import load_map
+from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.maps.scene import landmark_cameras, move_map_to, origin_of, unit_of
 from bidnerf_core.progress import counter, current_job, job_context
 
@@ -212,7 +212,10 @@ class Localizer:
         if isinstance(query, str | Path):
             query = Frame.read(query, CameraSource(assumed=self.assumed_cameras))
         views = [view.over(self.scene.bounds.background) for view in _views(query)]
-        return rig(self.scene, views, T_world_camera, depth_rays, self.matcher)
+        problem = rig(self.scene, views, T_world_camera, depth_rays, self.matcher)
+        # Landmarks alone are used, where there are some, while training is unfinished: rendering would cost much and add little.
+        is_unfinished = isinstance(self.scene, Map) and self.scene.info.interruption is not None
+        return replace(problem, colour_noise=1.0) if is_unfinished and problem.matcher is not None else problem
 
     def solve(self, problem: Problem, seed: int = 0) -> Localization:
         """Solve a ``problem`` created by this localizer; the pose is in the map's own coordinates.

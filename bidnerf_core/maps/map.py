@@ -147,11 +147,8 @@ class Map:
 
     @property
     def colour_noise(self) -> float | None:
-        """Root mean square error of the field's colours (in [0, 1]) on the map's training images; None if unknown.
-
-        While training is unfinished, it is 1, so that landmarks alone are used where there are some: rendering costs more than it tells.
-        """
-        return self.info.colour_noise if self.info.interruption is None else 1.0
+        """Root mean square error of the field's colours (in [0, 1]) on the map's training images; None if unknown."""
+        return self.info.colour_noise
 
     @cached_property
     def capture(self) -> CaptureReport | None:

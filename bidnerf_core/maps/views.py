@@ -90,13 +90,7 @@ class ReadViews:
 
     def scaled(self, factor: float) -> ReadViews:
         """Return the views with all lengths, poses and measured depth, multiplied by ``factor``."""
-
-        def scale(view: View) -> View:
-            T, depth = view.T_ref_camera, view.frame.depth
-            frame = view.frame if depth is None else view.frame.replace(depth=depth * factor)
-            return replace(view, frame=frame, T_ref_camera=SE3(T.rotation, T.translation * factor))
-
-        return self if factor == 1 else replace(self, views=[scale(view) for view in self.views])
+        return self if factor == 1 else replace(self, views=[scaled_view(view, factor) for view in self.views])
 
     def with_files(self, cameras: Sequence[StoredCamera]) -> tuple[StoredCamera, ...]:
         """Return the cameras of the views, with the file of each image.
@@ -205,6 +199,18 @@ def _read_dataset(data: Capture, split: str, largest: int | None, folder: Path |
         data.up,
         depth_unit=data.depth_unit,
         files={name: Path(os.path.relpath(file, folder)).as_posix() for name, file in files.items() if once[file] == 1},
+    )
+
+
+def scaled_view(view: View, factor: float) -> View:
+    """Return a view with all lengths multiplied by ``factor``: pose, motion, measured depth and distances of landmarks."""
+    T, depth, seen, motion = view.T_ref_camera, view.frame.depth, view.landmarks, view.motion
+    return replace(
+        view,
+        frame=view.frame if depth is None else view.frame.replace(depth=depth * factor),
+        T_ref_camera=SE3(T.rotation, T.translation * factor),
+        landmarks=seen and replace(seen, distance=seen.distance * factor, deviation=seen.deviation * factor),
+        motion=None if motion is None else torch.cat([motion[:3] * factor, motion[3:]]),
     )
 
 

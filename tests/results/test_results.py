@@ -287,7 +287,9 @@ def test_what_is_localized_may_be_given_in_any_form(folder: Path) -> None:
     assert bn.localize(known, frames[0]).accepted[0].name == frames[0].name
     photo = next((folder / "images").rglob("*.png"))
     assert bn.localize(known, [photo, photo.parent / "none.png"]).names == [photo.stem, "none"]
-    with refused(where="queries", found="got a int", expected="photos by path, or a Frame, View or list of Views"):
+    with refused(
+        where="queries", found="got a int", expected="photos or a dataset by path, or a Frame, View or list of Views"
+    ):
         bn.localize(known, [7])  # type: ignore[list-item]
     with refused(where="queries", found="got a int"):
         bn.localize(known, 7)  # type: ignore[arg-type]

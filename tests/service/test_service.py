@@ -765,7 +765,7 @@ def test_maps_and_settings_that_cannot_be_served_are_refused(tmp_path: Path, bid
     for maps, part in (
         ([], "no MAP"),
         ({"a/b": "x"}, "its name is 'a/b'"),
-        (["x/a", "y/a"], "its name is 'a'"),
+        (["x/a", "y/a"], "two maps are named 'a'"),
     ):
         with pytest.raises(InputError, match=part):
             maps_by_name(maps)
