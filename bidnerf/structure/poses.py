@@ -93,7 +93,7 @@ def find_poses(
     pycolmap = import_pycolmap(str(source))
     images = photos_of(source, folder, camera)
     files = [shot.file for shot in images.shots if shot.file is not None]
-    inputs = digest(files or [source], camera, known or {})
+    inputs = digest(files or [source], camera, known)
     names = {shot.name for shot in images.shots}
     if known and files and not names & known.keys():
         raise InputError(

@@ -99,7 +99,9 @@ class FoundPoses:
         return "\n".join(filter(None, lines))
 
 
-def digest(files: Sequence[Path], camera: Camera | CameraSource | str | Path | None, known: Mapping[str, SE3]) -> str:
+def digest(
+    files: Sequence[Path], camera: Camera | CameraSource | str | Path | None, known: Mapping[str, SE3] | None = None
+) -> str:
     """Return a digest of the photos, of the settings with which their poses are estimated, and of poses that are ``known``."""
     identities = [[str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
     settings: list[Any] = [repr(camera) if isinstance(camera, Intrinsics) else str(camera), repr(DETECTOR)]

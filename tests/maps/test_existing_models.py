@@ -322,6 +322,9 @@ def test_photos_elsewhere_are_named_as_of_any_dataset(model: Model, tmp_path: Pa
         bn.import_map(model.folder / "sparse", bake=False, options=given)
     with refused(found=f"no such photo in {masks}"):
         bn.import_map(model.folder, options=bn.ImportOptions(bn.DatasetOptions(images=masks)))
+    model.write_database(model.folder / "database.db")
+    with refused(found="masks do not apply to stored keypoints", expected="none, or the keypoints of photos"):
+        bn.import_map(model.folder / "sparse", bake=False, options=given)
 
 
 def test_an_import_leaves_a_whole_map_or_nothing(model: Model, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -15,13 +15,14 @@ from bidnerf.results import read_positions
 from bidnerf.testing import BOUNDS, GROUND_CAMERA, textured_map, unseen
 from bidnerf_core.captures import stored_cameras
 from bidnerf_core.fields import levels
+from bidnerf_core.frames import SeenLandmarks
 from bidnerf_core.io import FileInUse, lock
 from bidnerf_core.localization import Loop
 
 # Inside: the place of a map by its name
 from bidnerf_core.maps import Anchor, Map, MapInfo, factor_of_distance, factor_of_poses, load_info
 from bidnerf_core.maps.known_lengths import locate_point
-from bidnerf_core.maps.views import views_again
+from bidnerf_core.maps.views import scaled_view, views_again
 from commands import Run, assert_refused
 from optional import require
 from refusals import refused
@@ -135,6 +136,16 @@ def test_images_in_the_unit_of_before_are_scaled_as_their_map_was(origin: tuple[
             torch.testing.assert_close(require(one.frame.depth), factor * require(other.frame.depth))
         assert [v.T_ref_camera.matrix().tolist() for v in posed] == [c.pose.matrix().tolist() for c in large.cameras]
     assert views_again(info, in_world)[0].views[0].frame is in_world[0].frame
+
+
+def test_all_lengths_of_a_view_are_scaled() -> None:
+    view, seen = unseen(), SeenLandmarks(torch.ones(2, 2), torch.tensor([1.0, 2.0]), torch.tensor([0.1, 0.2]))
+    motion = torch.tensor([1.0, 2.0, 3.0, 0.1, 0.2, 0.3], dtype=torch.float64)
+    large = scaled_view(replace(view, landmarks=seen, motion=motion), 2.0)
+    assert require(large.motion).tolist() == pytest.approx([2.0, 4.0, 6.0, 0.1, 0.2, 0.3])
+    assert require(large.landmarks).distance.tolist() == [2.0, 4.0]
+    torch.testing.assert_close(require(large.landmarks).deviation, 2 * seen.deviation)
+    torch.testing.assert_close(require(large.frame.depth), 2 * require(view.frame.depth))
 
 
 def test_a_map_in_metres_that_is_scaled_again_is_remarked(ground: Map, caplog: pytest.LogCaptureFixture) -> None:

@@ -250,6 +250,11 @@ def test_poses_that_were_found_are_not_sought_again(search: Search, tmp_path: Pa
     write_photos(fewer, walk(3))
     with refused(where=search.out, found="the poses of other photos"):
         bn.find_poses(fewer, search.out)
+    name = min(search.photos.iterdir()).stem
+    with refused(where=search.out, found="the poses of other photos"):  # nor those found without the known ones
+        bn.find_poses(search.photos, search.out, known={name: bn.SE3.identity()})
+    with refused(where=search.photos, found="known has none of the"):
+        bn.find_poses(search.photos, search.out, known={f"{name}.png": bn.SE3.identity()})
 
 
 def test_train_takes_photos_without_poses(search: Search, bidnerf: Run, caplog: pytest.LogCaptureFixture) -> None:
