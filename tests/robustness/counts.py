@@ -62,7 +62,9 @@ def counted(kind: str, scale: float) -> dict[str, Any]:
     with TemporaryDirectory() as place:
         Path(place).chmod(0o755)
         found = list(KINDS[kind](Path(place), scale))
-    defects = {check.name: list(check.wrong) for check in found if check.wrong}
+    # A record is read elsewhere, so its paths are those of the repository.
+    root = f"{Path(__file__).resolve().parents[2]}/"
+    defects = {check.name: [wrong.replace(root, "") for wrong in check.wrong] for check in found if check.wrong}
     after = os.times()
     return {
         "cases": len(found),
