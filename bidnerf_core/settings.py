@@ -88,13 +88,6 @@ class Above(Range):
         return f"more than {least}" + (f", at most {most}" if most else "")
 
 
-class Angle(Above):
-    """The range of an angle in degrees."""
-
-    def __str__(self) -> str:
-        return f"{super().__str__()} degrees"
-
-
 class WholeNumbers(Range):
     """The whole numbers from ``least`` to ``most``."""
 
@@ -103,6 +96,17 @@ class WholeNumbers(Range):
 
     def __str__(self) -> str:
         return f"a whole number, {super().__str__().removeprefix('a number ')}"
+
+
+def check_hfov(degrees: Any) -> None:
+    """Raise ``InputError`` unless ``degrees`` is a horizontal field of view that no one can have stated in radians."""
+    if not isinstance(degrees, Real) or not NARROWEST_HFOV < cast(float, degrees) <= WIDEST_HFOV:
+        expected = f"degrees, more than {NARROWEST_HFOV:g} and at most {WIDEST_HFOV:g}"
+        if isinstance(degrees, Real) and 0 < cast(float, degrees) <= NARROWEST_HFOV:
+            expected += (
+                f" (radians? then {math.degrees(degrees):.4g} degrees; for a telescope, the focal length: `focal`)"
+            )
+        raise InputError(f"`hfov` is {degrees!r:.60}", expected=expected)
 
 
 def _limits(allowed: Range) -> list[str]:

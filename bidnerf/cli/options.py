@@ -18,7 +18,7 @@ from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.installation import import_extra
 from bidnerf_core.io import require_existing
 from bidnerf_core.registry import USUAL_FEATURES, USUAL_METHOD, Plugins
-from bidnerf_core.settings import EXPERT, LARGEST_SEED, NARROWEST_HFOV, WIDEST_HFOV, Above, Angle, OneOf, WholeNumbers
+from bidnerf_core.settings import EXPERT, LARGEST_SEED, Above, OneOf, WholeNumbers, check_hfov
 
 if TYPE_CHECKING:
     from bidnerf_core.camera import CameraSource, Intrinsics
@@ -212,11 +212,11 @@ class CameraOptions:
     """The camera of images whose format stores none."""
 
     focal: Annotated[float | None, Above(0.0), Option("PX", "focal length in pixels of the image file")] = None
-    hfov: Annotated[
-        float | None, Angle(NARROWEST_HFOV, WIDEST_HFOV), Option("DEG", "horizontal field of view of the upright image")
-    ] = None
+    hfov: Annotated[float | None, Option("DEG", "horizontal field of view of the upright image")] = None
 
     def __post_init__(self) -> None:
+        if self.hfov is not None:
+            check_hfov(self.hfov)
         require_one({"--focal": self.focal, "--hfov": self.hfov})
 
     def source(self, camera: Any, assumed: Sequence[Intrinsics] = ()) -> CameraSource:

@@ -19,7 +19,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from bidnerf_core.errors import InputError, spelling_hint
-from bidnerf_core.settings import LARGEST_SEED, NARROWEST_HFOV, WIDEST_HFOV
+from bidnerf_core.settings import LARGEST_SEED, WIDEST_HFOV
 
 LONGEST_NAME = 200
 """Maximum number of characters of a name in an answer."""
@@ -80,7 +80,7 @@ class PhotoForm(BaseModel):
     map: str = Field(ABSENT, description="by default the one that the photo shows")
     name: str = Field(ABSENT, min_length=1, max_length=LONGEST_NAME, description="the frame's name in the answer")
     focal: Number = Field(ABSENT, ge=1e-3, le=1e9, description="focal length in pixels of the stored image")
-    hfov: Number = Field(ABSENT, gt=NARROWEST_HFOV, le=WIDEST_HFOV, description="horizontal field of view in degrees")
+    hfov: Number = Field(ABSENT, ge=0, le=WIDEST_HFOV, description="horizontal field of view in degrees, over 3")
     depth_unit: Number = Field(ABSENT, ge=1e-9, le=1e9, description="metres per step of the depth image")
     seed: Annotated[int, BeforeValidator(_require_decimal)] = Field(
         ABSENT, ge=0, le=LARGEST_SEED, description="seed of every random choice"
@@ -103,7 +103,6 @@ class PhotoForm(BaseModel):
 
 EXPECTED_VALUES = {
     "greater_than_equal": "a number from {ge:g} up",
-    "greater_than": "a number above {gt:g}",
     "less_than_equal": "a number up to {le:g}",
     "float_type": "a number",
     "float_parsing": "a number",

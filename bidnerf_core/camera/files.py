@@ -2,8 +2,8 @@
 
 Supported formats are the JSON of NeRF, nerfstudio, Open3D, RealSense and 3D Gaussian Splatting, an answer's and its
 ``intrinsics``, COLMAP's ``cameras.txt``, hloc's lists of images with cameras, YAML from ROS, OpenCV, ORB-SLAM and Kalibr, ROS's
-``ost.txt``, XML from OpenCV and Agisoft, and matrices as text. Pixel centres are at +0.5 unless the format follows OpenCV, as
-matrices, Open3D, RealSense and the YAML files do.
+``ost.txt``, XML from OpenCV and Agisoft, and matrices or ``fx fy cx cy [width height]`` as text, CSV and NumPy's files. Pixel centres
+are at +0.5 unless the format follows OpenCV, as matrices, bare numbers, Open3D, RealSense and the YAML files do.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from bidnerf_core.camera.lenses import (
 )
 from bidnerf_core.errors import InputError, errors_in
 from bidnerf_core.io import (
+    Archive,
     Record,
     from_plain,
     parse_json,
@@ -36,6 +37,7 @@ from bidnerf_core.io import (
     parse_rows,
     parse_xml,
     parse_yaml,
+    read_array,
     read_file,
 )
 
@@ -92,9 +94,12 @@ DISTORTIONS = {
 """The names of distortion models in calibrations, in lower case, by our kind of model."""
 CAMERA_FORMATS = (
     "a camera: JSON (fl_x or fx, K, mtx or camera_matrix), YAML of ROS, OpenCV or Kalibr, COLMAP's cameras.txt (from cameras.bin:"
-    " model_converter), hloc's list of images, ROS's ost.txt, XML of OpenCV or Agisoft, or a 3x3 matrix as text"
+    " model_converter), hloc's list of images, ROS's ost.txt, XML of OpenCV or Agisoft, or a 3x3 matrix or fx fy cx cy"
+    " [width height] as text, .npy or .npz"
 )
 """The files of cameras that are read, for messages."""
+MATRIX_COLUMNS = {9: 3, 12: 4, 16: 4}
+"""The columns of a camera's matrix of 3x3, 3x4 or 4x4, by the count of its numbers."""
 OWN_KEYS = {"fx", "fy", "cx", "cy", "width", "height", "distortion"}
 """The keys of ``Intrinsics`` as JSON, with pixel centres at +0.5."""
 MOST_LINES = 100_000
@@ -167,6 +172,12 @@ def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> 
     """
     content = read_file(path, CAMERA_FORMATS)
     start = content.lstrip(b"\xef\xbb\xbf \t\r\n")
+    if start.startswith(b"\x93NUMPY"):
+        return parse_calibration(str(path), {"K": read_array(path, CAMERA_FORMATS).tolist()}, size)
+    if start.startswith(b"PK"):
+        archive, known = Archive(path, CAMERA_FORMATS), {f"{key}.npy" for keys in KEYS.values() for key in keys}
+        arrays = {name: read_array(archive.file(name), CAMERA_FORMATS) for name in archive.names if name in known}
+        return parse_calibration(str(path), {name[:-4]: array.tolist() for name, array in arrays.items()}, size)
     if start[:1] == b"[" and start[1:].lstrip()[:1] == b"{":
         return _choose(path, _splat_cameras(path, content), photo)
     if re.match(rb"\[\s*[\[\d.+-]", start):
@@ -180,11 +191,17 @@ def read_camera(path: Path, size: tuple[int, int], photo: str | None = None) -> 
     if (lines := content.count(b"\n")) > MOST_LINES:
         raise InputError(f"has {lines:,} lines", where=path, expected=f"a list of at most {MOST_LINES:,} cameras")
     rows = parse_rows(content, path, CAMERA_FORMATS, "CAMERA_ID MODEL WIDTH HEIGHT and parameters")
-    numbers = [float(word) for row in rows[:4] for word in row.words if NUMBER.fullmatch(word)]
-    # A matrix of 3x3, 3x4 or 4x4, in one row or in several.
-    width = {9: 3, 12: 4, 16: 4}.get(len(numbers))
-    if width is not None and sum(len(row.words) for row in rows) == len(numbers):
-        return _opencv_camera(str(path), np.array(numbers).reshape(-1, width)[:3, :3], (), "", size)
+    words = [word for row in rows[:16] for word in re.split(r"[\s,;]+", row.text.strip(" ,;"))]
+    if len(rows) <= 16 and all(map(NUMBER.fullmatch, words)):
+        numbers = [float(word) for word in words]
+        if len(numbers) in (4, 6) and len(rows) in (1, len(numbers)):
+            width, height = numbers[4:] or size
+            if not (0 < numbers[2] < width and 0 < numbers[3] < height):
+                found = f"cx and cy are {numbers[2]:g} and {numbers[3]:g} for an image of {width:g}x{height:g}"
+                raise InputError(found, where=path, expected="fx fy cx cy, or fx fy cx cy width height, in pixels")
+            return parse_calibration(str(path), {"K": numbers[:4], "size": [width, height]}, size)
+        if len(numbers) in MATRIX_COLUMNS:
+            return parse_calibration(str(path), {"K": numbers}, size)
     if any(row.text == "camera matrix" for row in rows):
         sections, title = dict[str, Any](), ""
         for row in rows:
@@ -261,7 +278,7 @@ def _json_camera(record: Record, size: tuple[int, int]) -> Camera:
             )
         values = {**values, "K": [fx, 0, cx, 0, fx if fy is None else fy, cy, 0, 0, 1], "w": None}
         values |= {"distortion_model": str(values.get("model", "")).rpartition(".")[2]}
-    if any(values.get(key) for key in ("intrinsic_matrix", "intrinsic", *KEYS["K"])):
+    if any(values.get(key) for key in ("intrinsics", "intrinsic", *KEYS["K"])):
         return parse_calibration(record.where, values, size)
     if not any(key in values for key in ("camera_model", "fl_x", "camera_angle_x")):
         raise record.error("no focal length", expected=CAMERA_FORMATS)
@@ -344,17 +361,24 @@ def parse_calibration(where: str, values: Mapping[str, Any], size: tuple[int, in
         four, lens = ([values.get(f"{slam}.{x}", 0.0) for x in some] for some in (("fx", "fy", "cx", "cy"), names))
     if given is None and four is None:
         raise InputError(f"no camera matrix ({', '.join(KEYS['K'][:3])} or K)", where=where, expected=CAMERA_FORMATS)
-    K = _array(where, four if given is None else given)
-    if K.shape == (4,):
-        K = np.array(((K[0], 0, K[2]), (0, K[1], K[3]), (0, 0, 1)))
-    elif "intrinsic_matrix" in values and not isinstance(given, Mapping) and K.shape == (9,):  # by columns
-        K = K.reshape(3, 3).T
+    K = _camera_matrix(_array(where, four if given is None else given))
     pair = _first(values, "size") or [_first(values, key) or 0 for key in ("width", "height")]
     sides = _array(where, pair).ravel().astype(int).tolist()
     if len(sides) != 2:
         raise InputError(f"size is {str(pair)[:60]!r}", where=where, expected="width and height in pixels")
     lens = tuple(_array(where, lens or []).ravel().tolist())
     return _opencv_camera(where, K, lens, model, (sides[0], sides[1]) if min(sides) > 0 else size)
+
+
+def _camera_matrix(numbers: np.ndarray) -> np.ndarray:
+    """Return the 3x3 matrix of fx, fy, cx and cy, or of a larger matrix in rows or, as ARKit and Open3D write it, in columns."""
+    if numbers.size == 4:
+        fx, fy, cx, cy = numbers.ravel()
+        return np.array(((fx, 0, cx), (0, fy, cy), (0, 0, 1)))
+    if numbers.size not in MATRIX_COLUMNS:
+        return numbers
+    K = numbers.reshape(-1, MATRIX_COLUMNS[numbers.size])[:3, :3]
+    return K.T if K[2, :2].any() and not K[:2, 2].any() else K
 
 
 def _opencv_camera(where: str, K: Any, lens: tuple[float, ...], model: str, size: tuple[int, int]) -> Camera:

@@ -23,7 +23,7 @@ from torch import Tensor
 from bidnerf_core.camera.exif import Orientation
 from bidnerf_core.devices import constant
 from bidnerf_core.errors import InputError
-from bidnerf_core.settings import WIDEST_HFOV
+from bidnerf_core.settings import check_hfov
 
 LIMITS: dict[str, tuple[type, float, float, str]] = {
     "focal length": (Real, 1e-6, 1e9, "a positive number, at least 1e-06 pixels and at most 1e+09 pixels"),
@@ -83,14 +83,7 @@ class Intrinsics:
     @staticmethod
     def from_hfov(degrees: float, width: int, height: int) -> Intrinsics:
         """Return an undistorted camera with a horizontal field of view of ``degrees``; see ``from_focal``."""
-        check_number(
-            "horizontal field of view",
-            degrees,
-            Real,
-            1e-9,
-            WIDEST_HFOV,
-            f"degrees above 0, at most {WIDEST_HFOV:g}",
-        )
+        check_hfov(degrees)
         check_number("width", width, *LIMITS["size"])
         return Intrinsics.from_focal(focal_length(width, math.radians(degrees)), width, height)
 

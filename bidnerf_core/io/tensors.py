@@ -24,21 +24,24 @@ from torch.utils._pytree import tree_leaves
 from bidnerf_core.errors import InputError
 from bidnerf_core.io.allowance import Allowance
 from bidnerf_core.io.archives import Archive
-from bidnerf_core.io.files import open_binary, reason
+from bidnerf_core.io.files import PackedFile, open_binary, reason
 
 _Part = TypeVar("_Part")
 
 TENSOR_FILE = "a safetensors file"
 
 
-def read_array(path: Path, expected: str) -> np.ndarray:
+def read_array(path: Path | PackedFile, expected: str) -> np.ndarray:
     """Read the array of a ``.npy`` file. Raises ``InputError`` for anything else, including pickled objects.
 
     ``expected`` briefly describes what the file should be.
     """
-    open_binary(path, expected).close()
     try:
-        return np.array(np.lib.format.open_memmap(path, mode="r"))  # a mapping reaches no farther than the file
+        with open_binary(path, expected) as file:
+            array: np.ndarray = np.lib.format.read_array(file, allow_pickle=False)
+            return array
+    except InputError:
+        raise
     except Exception as error:  # NumPy parses the header as Python, which may raise anything
         raise InputError(f"not readable as an array ({reason(error)})", where=path, expected=expected) from error
 

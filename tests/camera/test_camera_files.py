@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -93,9 +94,26 @@ def opencv(camera: Intrinsics, *names: str, kind: str = ".yaml", **sizes: int) -
     return str(storage.releaseAndGetString())
 
 
+def columns(camera: Intrinsics) -> list[float]:
+    """The matrix by columns, as ARKit and Open3D write it."""
+    flat: list[float] = np.reshape(matrix(camera), (3, 3)).T.ravel().tolist()
+    return flat
+
+
+def numbers_of(camera: Intrinsics) -> str:
+    """The numbers fx fy cx cy of a matrix."""
+    return " ".join(map(repr, [camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5]))
+
+
+def numpy_file(write: Callable[..., None], *arrays: object, **named: object) -> bytes:
+    """The file in which NumPy saves arrays."""
+    file = io.BytesIO()
+    write(file, *arrays, **named)
+    return file.getvalue()
+
+
 def open3d(camera: Intrinsics) -> dict[str, object]:
-    columns = np.array(matrix(camera)).reshape(3, 3).T.ravel().tolist()
-    return {"width": camera.width, "height": camera.height, "intrinsic_matrix": columns}
+    return {"width": camera.width, "height": camera.height, "intrinsic_matrix": columns(camera)}
 
 
 def ost(camera: Intrinsics) -> str:
@@ -144,7 +162,7 @@ def splats(*cameras: Intrinsics) -> str:
 
 
 NAMES = ("camera_matrix", "distortion_coefficients")
-FILES: dict[str, tuple[Callable[[Intrinsics], str], int]] = {
+FILES: dict[str, tuple[Callable[[Intrinsics], str | bytes], int]] = {
     "info.yaml": (ros_info, 5),
     "topic.yml": (ros_topic, 5),
     "opencv.yml": (lambda camera: opencv(camera, *NAMES, image_width=640, image_height=480), 5),
@@ -168,6 +186,20 @@ FILES: dict[str, tuple[Callable[[Intrinsics], str], int]] = {
     "row.txt": (lambda camera: as_text(camera, width=4).replace("\n", " "), 0),
     "K.json": (lambda camera: json.dumps(np.reshape(matrix(camera), (3, 3)).tolist()), 0),
     "list.txt": (lambda camera: HLOC.format(camera=camera), 0),
+    "K.csv": (lambda camera: as_text(camera).replace(" ", ","), 0),
+    "four.txt": (lambda camera: "# fx fy cx cy\n" + numbers_of(camera), 0),
+    "six.csv": (lambda camera: numbers_of(camera).replace(" ", ", ") + ", 640, 480\n", 0),
+    "lines.txt": (lambda camera: numbers_of(camera).replace(" ", "\n"), 0),
+    "columns.json": (lambda camera: json.dumps(columns(camera)), 0),
+    "arkit.json": (lambda camera: json.dumps({"intrinsics": columns(camera), "width": 640, "height": 480}), 0),
+    "K.npy": (lambda camera: numpy_file(np.save, np.reshape(matrix(camera), (3, 3))), 0),
+    "four.npy": (lambda camera: numpy_file(np.save, np.array(numbers_of(camera).split(), float)), 0),
+    "calibration.npz": (
+        lambda camera: numpy_file(
+            np.savez, mtx=np.reshape(matrix(camera), (3, 3)), dist=camera.distortion, rvecs=np.eye(9)
+        ),
+        5,
+    ),
 }
 """What writes a camera as other programs do, and how many of its coefficients the format keeps."""
 
@@ -182,7 +214,8 @@ CAMERAS = st.builds(
 @given(camera=CAMERAS)
 def test_camera_files_of_other_programs_give_their_camera_back(name: str, camera: Intrinsics, tmp_path: Path) -> None:
     write, kept = FILES[name]
-    (tmp_path / name).write_text(write(camera))
+    content = write(camera)
+    (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     found = read_camera(tmp_path / name, SIZE, "elsewhere/a.jpg")
     assert isinstance(found, Intrinsics)
     centre = (320.0, 240.0) if write is splats else (camera.cx, camera.cy)
@@ -278,6 +311,8 @@ def test_fisheye_calibrations(content: str, tmp_path: Path) -> None:
         "two cameras": (ost(CAMERA) + ost(CAMERA), "a second camera"),
         "no centre": ('{"fx": 500, "fy": 500}', "no cx and cy"),
         "prose": ("my camera has 500 pixels\n", "camera model camera"),
+        "another order": ("640 480 500 500 320 240\n", "cx and cy are 500 and 500 for an image of 320x240"),
+        "the centre first": ("320 240 500 510\n", "cx and cy are 500 and 510 for an image of 640x480"),
         "half a matrix": ("500 0 320\n0 500 240\n", "line 1 has 3 entries"),
     }.values(),
 )

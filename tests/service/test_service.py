@@ -374,7 +374,7 @@ def test_what_is_missing_is_named(service: Service, inputs: Inputs) -> None:
         (f"map=map&focal={'9' * 5000}", "focal is", "a number up to"),
         (f"map=map&seed={'9' * 5000}", "seed is"),
         ("map=map&hfov=179.9", "expected a number up to 170"),
-        ("map=map&hfov=1.18", "expected a number above 3"),
+        ("map=map&hfov=1.18", "hfov is 1.18, expected degrees, more than 3", "(radians? then 67.61 degrees"),
         ("image=photo.png", 'unknown parameter "image", expected any of', "photo"),
         ("map=map&focal=0.001", "focal is 0.001 for 24 columns, expected at least 1.05"),
     ):
