@@ -180,8 +180,13 @@ def load_info(folder: Path) -> MapInfo:
             stacklevel=2,
         )
         found = {key: value for key, value in found.items() if key not in unknown}
+    # In parts, since a conversion takes several times the memory of its value.
+    listed, cameras = found.get("cameras"), list[StoredCamera]()
     try:
-        info = from_plain(MapInfo, found, str(path))
+        while isinstance(listed, list) and listed:
+            cameras += from_plain(list[StoredCamera], listed[:1000], f"{path}: cameras")
+            del listed[:1000]
+        info = replace(from_plain(MapInfo, found, str(path)), cameras=tuple(cameras))
     except InputError as error:
         raise with_writer(error, writer) from error
     if (folder / ANCHOR).exists():
