@@ -41,7 +41,6 @@ from damage import (
 from harness import (
     AUTO,
     BAKED,
-    MEMORY,
     NOBODY,
     QUICK,
     Check,
