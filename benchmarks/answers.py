@@ -23,7 +23,8 @@ scenes differ in size, errors of the position are relative to the distance of wh
 ``--compare`` counts, over the answers that both files have, those that are right (within 5 degrees and 0.05 units), strictly
 right (1 degree, 0.02), accepted, and silent (accepted and not right); how many of the accepted with a known error lie inside
 the 95 % bound of their covariance; the median squared error of the right ones, in units of the covariance and relative to the
-median of its distribution (1 for a true covariance); and the median and the longest CPU time. Exact McNemar tests of both files follow, and how
+median of its distribution (1 for a true covariance), a Student-t distribution with the degrees of freedom that maps assume; how many
+degrees are likeliest; and the median and the longest CPU time. Exact McNemar tests of both files follow, and how
 many answers changed. ``--name`` joins the rows, or files of them, into ``results/NAME.rows.jsonl.xz``, and summarises them in
 ``results/NAME.json``.
 """
@@ -65,12 +66,14 @@ from _lab import (
     without_depth,
     without_tuning,
 )
-from scipy.stats import binomtest, chi2
+from scipy.special import gammaln
+from scipy.stats import binomtest, chi2, f
 from torch import Generator, Tensor
 from torch.nn.functional import interpolate
 
 from bidnerf import Localizer
 from bidnerf.evaluation import faulty, provenance, warp
+from bidnerf_core.captures.trial import ERRORS
 from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
@@ -85,6 +88,8 @@ PLANES = "planes"
 START_DEGREES = 5.0
 TILT = {"tilted": math.radians(30), "full": math.radians(10)}
 WALL_DISTANCE = 2.0
+MEDIAN = float(chi2.ppf(0.95, 6) * f.median(6, ERRORS) / f.ppf(0.95, 6, ERRORS))
+"""Median of squared errors in units of their covariance, of which 95 % lie within the 95 % bound of a Gaussian."""
 ROUNDING = 1e-6
 """Smallest change of an entry of a pose that counts as one."""
 
@@ -446,6 +451,25 @@ def answers_of(rows: dict[tuple[str, ...], Row]) -> dict[tuple[str, ...], Row]:
     return {key: row for key, row in rows.items() if key[0] != "about"}
 
 
+def likeliest_freedom(groups: Sequence[Sequence[float]]) -> int | None:
+    """Return the degrees of freedom, of 1 to 30, with which squared errors are likeliest to have a six-dimensional Student-t distribution.
+
+    Each group has errors of its own scale, such as those of one map.
+    """
+    scales = torch.logspace(-2, 2, 161, dtype=torch.float64)[:, None]
+
+    def log_likelihood(freedom: int) -> float:
+        constant = gammaln((freedom + 6) / 2) - gammaln(freedom / 2) - 3 * math.log(freedom)
+        of_groups = [torch.tensor(squared, dtype=torch.float64) for squared in groups]
+        logs = [
+            constant - 3 * scales.log() - (freedom + 6) / 2 * (squared / (freedom * scales)).log1p()
+            for squared in of_groups
+        ]
+        return sum(float(log.sum(1).max()) for log in logs)
+
+    return max(range(1, 31), key=log_likelihood) if any(groups) else None
+
+
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
     """Return the counts of some answers."""
     judged, times = judgement(rows), cpu_seconds(rows)
@@ -458,7 +482,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
         "accepted": judged["converged"],
         "silent": judged["silent"],
         "inside": judged["inside_95_of_converged"],
-        "scale": median(known) / float(chi2.median(6)) if known else None,
+        "scale": median(known) / MEDIAN if known else None,
         "median_s": times["median_cpu_seconds"],
         "slowest_s": times["slowest_cpu_seconds"],
     }
@@ -572,7 +596,12 @@ def keep(paths: Sequence[Path], name: str) -> None:
     for (scene, mode, condition), some in cells(list(answers)).items():
         found.setdefault(f"{scene}, {mode}", {})[condition] = summary([answers[key] for key in some])
     maps = {key[1]: [row["commit"], *row["content"]] for key, row in rows.items() if key[0] == "about"}
-    record(name, {"commit_and_content_of_maps": maps, "counts": found}, SEED)
+    groups: dict[tuple[str, str], list[float]] = {}
+    for (scene, mode, condition, _), row in answers.items():
+        if condition == "as it is" and within(row) and (squared := row["normalized_error_squared"]) is not None:
+            groups.setdefault((scene, mode), []).append(squared)
+    freedom = likeliest_freedom([*groups.values()])
+    record(name, {"commit_and_content_of_maps": maps, "degrees_of_freedom": freedom, "counts": found}, SEED)
 
 
 def main() -> None:

@@ -18,9 +18,8 @@ from torch import Tensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import has_field
 from bidnerf_core.frames import View
-from bidnerf_core.geometry import KEYPOINTS_PER_INDEPENDENT, SE3
+from bidnerf_core.geometry import KEYPOINTS_PER_INDEPENDENT, SE3, chi_squared_quantile
 from bidnerf_core.localization import (
-    HEAVY_TAILS,
     LANDMARK_BOUNDS,
     LandmarkAnswer,
     LandmarkMatcher,
@@ -43,6 +42,13 @@ from bidnerf_core.mapping import (
 
 FREEDOM = 30.0
 """Degrees of freedom of the Student-t distribution of errors in units of their covariance: a few poses are wrong."""
+ERRORS = 4.0
+"""Degrees of freedom of the errors of poses in units of their predicted covariance.
+
+With a factor on the covariance for each map, those of the answers on record (``answers_unchanged``) are likeliest with 3 to 4 degrees.
+"""
+TAILS = (HeldOutTrial.tails, 0.4)
+"""Prior, as below, of the factor after which a Gaussian's 95 % ellipsoid holds 95 % of the errors."""
 CORRELATION = (3.0, 1.5)
 """Prior of the number of keypoints that count as one: median over maps, and standard deviation of the logarithm.
 
@@ -97,8 +103,20 @@ def tried_landmarks(
             ),
         )
         landmarks = replace(landmarks, pose_covariance=min(share, 1.0) * errors)
+    tails = factor_of_tails(updates, predicted_covariances(answers, matches, landmarks))
     factors = _factors(matches, landmarks)
-    return replace(landmarks, calibration_scatter=_calibration_scatter(answers, factors))
+    return replace(
+        landmarks, trial=replace(trial, tails=tails), calibration_scatter=_calibration_scatter(answers, factors)
+    )
+
+
+def factor_of_tails(errors: Float[Tensor, "n 6"], covariances: Float[Tensor, "n 6 6"]) -> float:
+    """Return the factor on predicted covariances after which a Gaussian's 95 % ellipsoid holds 95 % of the errors of poses."""
+    from scipy.special import fdtri  # scipy.stats takes a tenth of the total import time
+
+    # The 95 % ellipsoid of the Student-t distribution, relative to that of a Gaussian with the same matrix.
+    wider = 6 * fdtri(6, ERRORS, 0.95) / chi_squared_quantile(0.95, 6)
+    return _most_probable(TAILS, lambda factor: _student(errors, factor / wider * covariances, ERRORS))
 
 
 def held_out_images(count: int) -> list[int]:
@@ -204,19 +222,19 @@ def _most_probable(prior: tuple[float, float], log_likelihood: Callable[[float],
     )[1]
 
 
-def _student(errors: Float[Tensor, "n d"], covariances: Float[Tensor, "n d d"]) -> float:
+def _student(errors: Float[Tensor, "n d"], covariances: Float[Tensor, "n d d"], freedom: float = FREEDOM) -> float:
     """Return the log likelihood of errors with a multivariate Student-t distribution, up to a constant."""
     factor = torch.linalg.cholesky(covariances)
     squared = torch.linalg.solve_triangular(factor, errors[..., None], upper=False).square().sum((1, 2))
     log = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    return -float((log + (FREEDOM + errors.shape[1]) / 2 * (squared / FREEDOM).log1p()).sum())
+    return -float((log + (freedom + errors.shape[1]) / 2 * (squared / freedom).log1p()).sum())
 
 
 def predicted_covariances(
     answers: Sequence[LandmarkAnswer], matches: Sequence[int], landmarks: LandmarkMap
 ) -> Float[Tensor, "n 6 6"]:
     """Return the covariances of the answers as ``landmarks`` predict them."""
-    fits = torch.stack([answer.covariance / HEAVY_TAILS for answer in answers])
+    fits = torch.stack([answer.covariance / HeldOutTrial.tails for answer in answers])
     return _factors(matches, landmarks)[:, None, None] * fits + landmarks.pose_covariance
 
 

@@ -14,7 +14,6 @@ from .accept import support as support
 from .auto import localize_by_landmarks as localize_by_landmarks
 from .auto import within_limits as within_limits
 from .explanations import CAMERAS as CAMERAS
-from .loop import HEAVY_TAILS as HEAVY_TAILS
 from .loop import LandmarkAnswer as LandmarkAnswer
 from .loop import Loop as Loop
 from .matching import VOTERS as VOTERS

@@ -59,12 +59,10 @@ from bidnerf_core.localization.result import Localization, Verdict, current_reco
 from bidnerf_core.localization.terms.images import Images, refine_on_small_images
 from bidnerf_core.localization.terms.rays import RenderedRays
 from bidnerf_core.localization.terms.surface import Surface
-from bidnerf_core.mapping import CostTerm, Features, LandmarkMap, Landmarks, States, true_intrinsics
+from bidnerf_core.mapping import CostTerm, Features, HeldOutTrial, LandmarkMap, Landmarks, States, true_intrinsics
 
 DEPTH_WIDTH = 2.0
 """Ratio of the prior standard deviation of the depth scale to that of the sensor's model, since some sensors are off by far more."""
-HEAVY_TAILS = 1.7
-"""Factor on the covariance that makes a Gaussian's 95 % ellipsoid hold 95 % of the poses, since errors have heavier tails."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +233,7 @@ class Loop:
             others |= {"on_surface": float(near), "colour_inliers": float(both)}
         answer = self._judged(found, modes, landmarks, given, searched, others)
         # The uncertainty of the projection of the scene, in pixels; rays are worth rendering above 0.6.
-        blur = float(landmarks.focal.max()) * answer.evidence.precision / math.sqrt(HEAVY_TAILS)
+        blur = float(landmarks.focal.max()) * answer.evidence.precision / math.sqrt(HeldOutTrial.tails)
         # Also rendered: places and mirror images that are not much less probable; a mirror image at low resolution alone.
         odds = found.by_mode
         places = [g for g in odds.argsort(descending=True).tolist() if odds[g] > 1e-3]
@@ -361,8 +359,10 @@ class Loop:
         chance = sum(len(seen.matches(within, shift * within)) for shift in (4, -4)) / 2
         pixels = query.keypoints.pixels[mode.matches.keypoint]
         occupied = cells(pixels, query.camera) + CELLS**2 * query.view[mode.matches.keypoint]
-        covariance = HEAVY_TAILS * (found.mixture() + self.landmarks.pose_covariance)
-        position = float(covariance[:3, :3].trace().sqrt().nan_to_num(math.inf, math.inf))
+        errors = found.mixture() + self.landmarks.pose_covariance
+        # Whether a pose is accepted does not depend on what few images of a map showed of the tails of its errors.
+        position = float((HeldOutTrial.tails * errors[:3, :3].trace()).sqrt().nan_to_num(math.inf, math.inf))
+        covariance = self.landmarks.trial.tails * errors
         row = found.states.row
         # Modes that were refined to the same pose are one place; a mirror image is another one even there.
         middle = torch.tensor([0.0, 0.0, distance], dtype=torch.float64)

@@ -48,6 +48,8 @@ class HeldOutTrial(Settings):
     difference: NotNegative = (
         0.0  # usual mean loss of rays at a right pose, in squares of the loss's scale; 0 if unknown
     )
+    # Factor on the predicted covariance of a pose after which a Gaussian's 95 % ellipsoid holds 95 % of the errors
+    tails: Positive = 1.7
 
     def scaled(self, factor: float) -> HeldOutTrial:
         """Return the trial in a map with lengths multiplied by ``factor``."""
