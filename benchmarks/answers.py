@@ -73,7 +73,7 @@ from torch.nn.functional import interpolate
 
 from bidnerf import Localizer
 from bidnerf.evaluation import faulty, provenance, warp
-from bidnerf_core.captures.trial import ERRORS
+from bidnerf_core.captures import ERROR_FREEDOM
 from bidnerf_core.datasets import Capture, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
@@ -88,7 +88,7 @@ PLANES = "planes"
 START_DEGREES = 5.0
 TILT = {"tilted": math.radians(30), "full": math.radians(10)}
 WALL_DISTANCE = 2.0
-MEDIAN = float(chi2.ppf(0.95, 6) * f.median(6, ERRORS) / f.ppf(0.95, 6, ERRORS))
+MEDIAN = float(chi2.ppf(0.95, 6) * f.median(6, ERROR_FREEDOM) / f.ppf(0.95, 6, ERROR_FREEDOM))
 """Median of squared errors in units of their covariance, of which 95 % lie within the 95 % bound of a Gaussian."""
 ROUNDING = 1e-6
 """Smallest change of an entry of a pose that counts as one."""

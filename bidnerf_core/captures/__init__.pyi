@@ -30,6 +30,7 @@ from .training_views import RefinementChoice as RefinementChoice
 from .training_views import TrainingPoses as TrainingPoses
 from .training_views import prepare_views as prepare_views
 from .training_views import track_landmarks as track_landmarks
+from .trial import ERROR_FREEDOM as ERROR_FREEDOM
 from .trial import held_out_images as held_out_images
 from .trial import tried_field as tried_field
 from .trial import tried_landmarks as tried_landmarks

@@ -42,7 +42,7 @@ from bidnerf_core.mapping import (
 
 FREEDOM = 30.0
 """Degrees of freedom of the Student-t distribution of errors in units of their covariance: a few poses are wrong."""
-ERRORS = 4.0
+ERROR_FREEDOM = 4.0
 """Degrees of freedom of the errors of poses in units of their predicted covariance.
 
 With a factor on the covariance for each map, those of the answers on record (``answers_unchanged``) are likeliest with 3 to 4 degrees.
@@ -115,8 +115,8 @@ def factor_of_tails(errors: Float[Tensor, "n 6"], covariances: Float[Tensor, "n 
     from scipy.special import fdtri  # scipy.stats takes a tenth of the total import time
 
     # The 95 % ellipsoid of the Student-t distribution, relative to that of a Gaussian with the same matrix.
-    wider = 6 * fdtri(6, ERRORS, 0.95) / chi_squared_quantile(0.95, 6)
-    return _most_probable(TAILS, lambda factor: _student(errors, factor / wider * covariances, ERRORS))
+    wider = 6 * fdtri(6, ERROR_FREEDOM, 0.95) / chi_squared_quantile(0.95, 6)
+    return _most_probable(TAILS, lambda factor: _student(errors, factor / wider * covariances, ERROR_FREEDOM))
 
 
 def held_out_images(count: int) -> list[int]:

@@ -8,7 +8,7 @@ import torch
 # Inside: the fit of errors is tested without the localizations that they come from
 from bidnerf_core.captures.trial import (
     CORRELATION,
-    ERRORS,
+    ERROR_FREEDOM,
     EXCESS,
     TAILS,
     _most_probable,
@@ -41,8 +41,8 @@ def test_few_errors_leave_the_prior_and_one_wrong_pose_in_ten_changes_little(gen
 def test_the_covariance_holds_95_percent_of_heavy_tailed_errors(scale: float, generator: torch.Generator) -> None:
     root = torch.randn(6, 6, generator=generator, dtype=torch.float64)
     covariance = (root @ root.mT).expand(2000, 6, 6)
-    drawn = torch.randn(2000, 6 + int(ERRORS), generator=generator, dtype=torch.float64)
-    tails = (ERRORS / drawn[:, 6:].square().sum(1)).sqrt()  # of a Student-t distribution
+    drawn = torch.randn(2000, 6 + int(ERROR_FREEDOM), generator=generator, dtype=torch.float64)
+    tails = (ERROR_FREEDOM / drawn[:, 6:].square().sum(1)).sqrt()  # of a Student-t distribution
     errors = scale**0.5 * tails[:, None] * drawn[:, :6] @ root.mT
     factor = factor_of_tails(errors, covariance)
     squared = (errors[:, None] @ torch.linalg.solve(factor * covariance, errors[..., None])).flatten()
