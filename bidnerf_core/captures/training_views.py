@@ -23,6 +23,7 @@ from bidnerf_core.captures.coverage import shows_distances
 from bidnerf_core.captures.pose_conventions import pose_contradiction
 from bidnerf_core.captures.survey import link_photos, relocate_photos, suspects
 from bidnerf_core.carving import has_outline
+from bidnerf_core.depth import likely_unit
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import KEYPOINTS_PER_INDEPENDENT, SE3, mad_deviation
@@ -183,10 +184,7 @@ def check_depth_unit(tracked: TrackedViews, depth_unit: float | None = None) -> 
         return
     remedy = "check the unit of the depth images (depth_unit_scale_factor in a transforms.json)"
     if depth_unit is not None:
-        # Sensors count in round steps, such as 1 mm or 0.2 mm, and the ratio is known to some percent.
-        right = depth_unit / ratio
-        rounded = float(f"{right:.1g}")
-        right = rounded if abs(rounded / right - 1) < 0.05 else right
+        right = likely_unit(depth_unit / ratio)
         remedy = (
             f"if the poses are in metres, a step of the depth images is {right:.3g} m and not {depth_unit:.3g} m (`depth_unit`"
             f" {right:.3g}, or depth_unit_scale_factor in a transforms.json)"

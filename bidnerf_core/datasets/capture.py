@@ -136,9 +136,10 @@ class Shot:
             rgb, alpha = read_compact_image(self.image, background, None if size == raster.size else size)
         elif pixels is not None:
             rgb, alpha = pixels if size == raster.size else reduce_image(pixels, *size), None
-        metres, hidden = None, None
+        metres, hidden, step = None, None, None
         if self.depth is not None:
             measured, where = self.depth.read(), Path(self.depth.path)
+            step = measured.unit
             metres = (
                 fit_depth(measured, raster, size, f"{where}: depth")
                 if self.depth.sensor is None
@@ -150,7 +151,8 @@ class Shot:
             hidden[width:-width, width:-width] = False
             hidden = None if bool(hidden.all()) else hidden
         about: dict[str, Any] = {"camera_source": found.description, "focal_is_approximate": found.approximate}
-        return Frame.taken(self.name, camera, rgb, metres, alpha, hidden, **(about if self.tells_camera else {}))
+        about = {"depth_unit": step} | (about if self.tells_camera else {})
+        return Frame.taken(self.name, camera, rgb, metres, alpha, hidden, **about)
 
     def read(self, background: Colour = BLACK, side: int | None = None) -> Frame:
         """Read the frame and apply its masks. Raises ``WhollyHidden`` if they hide every pixel."""

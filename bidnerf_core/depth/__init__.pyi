@@ -2,6 +2,7 @@ from .images import MILLIMETRE as MILLIMETRE
 from .images import DepthImage as DepthImage
 from .images import DepthReader as DepthReader
 from .images import depth_image as depth_image
+from .images import likely_unit as likely_unit
 from .images import read_depth_image as read_depth_image
 from .registration import DepthCamera as DepthCamera
 from .registration import nearest_depth as nearest_depth

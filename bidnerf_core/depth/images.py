@@ -96,6 +96,12 @@ def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> Dept
     return DepthImage(torch.from_numpy(np.where(unmeasured, 0, metres).astype(np.float32)), float(unit), counts)
 
 
+def likely_unit(estimate: float) -> float:
+    """Return the unit (metres per step) behind an estimate, known to some percent: sensors count in round steps, such as 1 or 0.2 mm."""
+    rounded = float(f"{estimate:.1g}")
+    return rounded if abs(rounded / estimate - 1) < 0.05 else estimate
+
+
 def _absent(values: np.ndarray, metres: np.ndarray) -> dict[str, np.ndarray]:
     """Return masks of the values that mean "not measured", by their names in messages; the masks are disjoint."""
     is_float, finite = values.dtype.kind == "f", np.isfinite(values)

@@ -152,15 +152,17 @@ def estimate_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) ->
 
 
 def describe_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics, sensor: str) -> str | None:
-    """Return one line that compares the noise estimated from a depth image (metres) with the noise of ``sensor``.
+    """Return one line if the noise estimated from a depth image (metres) is not that of ``sensor`` within a factor of two.
 
-    Returns None if the noise cannot be estimated from the image.
+    Returns None if it is, and if the noise cannot be estimated from the image.
     """
     noise = estimate_depth_noise(depth, intrinsics)
     if noise is None:
         return None
     z = float(depth[depth > 0].median())
     estimated, expected = noise.deviation(z) / z, find_depth_sensor(sensor).noise.deviation(z) / z
+    if 0.5 * expected <= estimated <= 2 * expected:
+        return None
     return (
         f"the depth scatters by about {estimated:.2%} of the distance at {z:.3g} m, that of a {sensor!r} usually by"
         f" {expected:.2%}; `depth_sensor` states what measured it"

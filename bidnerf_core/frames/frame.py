@@ -106,6 +106,9 @@ class Frame:
     awaits_background: bool = False
     """Whether ``rgb`` is black behind transparent pixels only until a map is known, whose background then lies there."""
 
+    depth_unit: float | None = None
+    """The length (metres) of a step of the file or array that the depth was read from, if known."""
+
     def __post_init__(self) -> None:
         where, camera = f"frame {self.name}", self.intrinsics
         _check_camera(where, camera)
@@ -224,6 +227,7 @@ class Frame:
             focal_is_approximate=resolved.approximate,
             orientation=exif.orientation,
             awaits_background=background is None and alpha is not None,
+            depth_unit=None if measured is None else measured.unit,
         )
 
     @staticmethod
@@ -315,10 +319,10 @@ class Frame:
                 " of the same aspect ratio",
                 where=where,
             )
-        metres = None
+        metres, step = None, None
         if depth is not None:
             measured = depth_image(depth, depth_unit, f"{where}: depth")
-            metres = fit_depth(measured, raster, raster.size, f"{where}: depth")
+            metres, step = fit_depth(measured, raster, raster.size, f"{where}: depth"), measured.unit
             if notice := measured.notice(depth_unit is None):
                 warnings.warn(f"{where}: {notice}", InputWarning, stacklevel=2)
         laid = composite(colour, cover, BLACK if background is None else background_colour(background))
@@ -330,6 +334,7 @@ class Frame:
             cover,
             hidden=None if hidden is None else torch.as_tensor(hidden),
             awaits_background=background is None and cover is not None,
+            depth_unit=step,
         )
 
     def replace(self, **changes: Any) -> Frame:

@@ -22,7 +22,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from bidnerf_core.camera import CameraSource, Intrinsics
-from bidnerf_core.depth import UNKNOWN_SENSOR, DepthSensorModel, find_depth_sensor
+from bidnerf_core.depth import UNKNOWN_SENSOR, DepthSensorModel, find_depth_sensor, likely_unit
 from bidnerf_core.devices import constant, set_threads_here, threads_at_most, wait_for
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import Observations, device_of, has_field, render, render_picture
@@ -31,6 +31,7 @@ from bidnerf_core.geometry import SE3, pose_from_matrix
 from bidnerf_core.io import LARGEST_INTEGER, png_bytes
 from bidnerf_core.localization import (
     USUAL_METHOD,
+    Evidence,
     LandmarkMatcher,
     Localization,
     Outcome,
@@ -41,7 +42,9 @@ from bidnerf_core.localization import (
     require_fit,
     rig,
     settings_of,
+    shows_shape,
 )
+from bidnerf_core.mapping import trace
 from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.maps.scene import landmark_cameras, move_map_to, origin_of, unit_of
 from bidnerf_core.progress import counter, current_job, job_context
@@ -228,7 +231,7 @@ class Localizer:
             found = self._method.solve(problem, self.config, _checked_seed(seed))
         if not isinstance(found, Localization):
             raise InputError(f"method {self.method!r} returned a {type(found).__name__}", expected="a Localization")
-        found = replace(found, unit=unit_of(self.scene))
+        found = replace(found, reason=found.reason + describe_unused_depth(problem, found), unit=unit_of(self.scene))
         if self.scene.has_distances:
             return found
         outcome = Outcome.IMPRECISE if found.converged else found.outcome
@@ -260,6 +263,32 @@ class Localizer:
             render(field, bounds.rays(origins, directions), bounds.background)
         if self.scene.surface is not None:
             self.scene.surface.warm_up()
+
+
+def describe_unused_depth(problem: Problem, found: Localization) -> str:
+    """Return a clause on measured depth that contradicts an accepted pose by landmarks and was left out, with the unit that would fit.
+
+    It is empty if there is no such depth.
+    """
+    frame, surface = problem.views[-1].frame, problem.surface
+    is_used = not isinstance(found.diagnostics, Evidence) or found.diagnostics.on_surface is not None
+    if is_used or not found.converged or surface is None or frame.depth is None or not shows_shape(frame):
+        return ""
+    depth = frame.depth.cpu()
+    pixels = (depth > 0).nonzero()
+    pixels = pixels[:: 1 + len(pixels) // 500]
+    rays, length = frame.intrinsics.rays(pixels.flip(-1) + 0.5)
+    T = found.T_world_camera.to(surface.device, torch.float32)
+    directions = rays.to(surface.device) @ T.rotation.mT
+    seen = trace(surface, T.translation.expand_as(directions), directions).cpu()
+    ratios = seen / (depth[tuple(pixels.mT)] * length)  # infinite beside the surface
+    factor = float(ratios.median())
+    clause = ", without depth: it disagrees with the map"
+    # Most of the points have to agree on a factor; on another scene, or on something in front of it, they do not.
+    if float(((ratios / factor - 1).abs() < 0.1).float().mean()) < 0.5:
+        return clause
+    clause += f", which is {factor:.3g} times as far"
+    return clause + (f": is the depth unit {likely_unit(factor * frame.depth_unit):.3g} m?" if frame.depth_unit else "")
 
 
 def scene_of(given: object, where: str) -> SceneMap:

@@ -67,9 +67,11 @@ def test_another_name_is_an_error_that_lists_the_names() -> None:
 
 def test_localize_compares_a_named_sensor_with_the_image(generator: Generator) -> None:
     camera = Intrinsics.from_focal(100.0, 120, 90)
-    depth = torch.linspace(1.0, 1.3, 120).expand(90, 120) * (1 + 0.02 * torch.randn((90, 120), generator=generator))
+    plane, noise = torch.linspace(1.0, 1.3, 120).expand(90, 120), torch.randn((90, 120), generator=generator)
+    depth = plane * (1 + 0.02 * noise)
     sentence = require(describe_depth_noise(depth, camera, "kinect"))
     assert re.search(r"by about (1\.[6-9]|2\.[0-4])\d% of the distance .* a 'kinect' usually by 0\.\d+%", sentence)
+    assert describe_depth_noise(plane * (1 + 0.002 * noise), camera, "kinect") is None, "it agrees"
     assert describe_depth_noise(torch.zeros_like(depth), camera, "kinect") is None
 
 

@@ -105,6 +105,29 @@ def test_an_answer_shows_the_photo_beside_the_map_in_a_notebook() -> None:
     assert localizer().solve(localizer().problem(FRAME, START))._repr_html_().startswith("<div>&lt;Localization")
 
 
+@pytest.mark.parametrize(
+    ("scale", "words"),
+    [
+        (
+            5.0,
+            r"without depth: it disagrees with the map, which is 0\.(19|20)\d* times as far: is the depth unit 1 m\?",
+        ),
+        (0.001, r"which is (99\d|1e\+03) times as far: is the depth unit 1 m\?"),
+        (1.0, "fused with depth"),
+    ],
+)
+def test_depth_of_another_unit_is_named(scale: float, words: str) -> None:
+    frame = unseen().frame
+    assert frame.depth is not None
+    given = bn.Frame.from_numpy(frame.rgb_bytes, frame.intrinsics, depth=frame.depth, depth_unit=scale)
+    found = Localizer(textured_map(surface=True), warm_up=False)(given)
+    assert found.converged
+    assert re.search(words, found.reason)
+    if scale == 5:
+        flat = given.replace(depth=torch.linspace(3.0, 99.0, frame.depth.numel()).reshape(frame.depth.shape))
+        assert Localizer(textured_map(surface=True), warm_up=False)(flat).reason.endswith("it disagrees with the map")
+
+
 def test_an_answer_is_sent_to_another_process_without_its_map() -> None:
     found = localizer()(FRAME, START)
     again = pickle.loads(pickle.dumps(found))
