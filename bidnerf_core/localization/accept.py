@@ -50,9 +50,7 @@ class Evidence:
     mass: float  # probability that the pose is within the tolerance, and its camera credible
     searched: bool  # whether the pose was found by landmarks, not only confirmed by them
     mirrored: bool | None = None  # true if the mirror image was localized
-    other_view: float | None = (
-        None  # number of other keypoints that match from another pose, relative to those of this one
-    )
+    other_view: float | None = None  # number of other keypoints of the image that match from another pose
     on_surface: float | None = None  # fraction of the measured points on the surface
     colour_inliers: float | None = None  # fraction of the measured points on the surface and with its colour
     # mean robust loss of the rays relative to the usual one of the map's own images; None if no rays were rendered
@@ -148,6 +146,11 @@ LANDMARK_BOUNDS = (
     Bound("mass", 0.8, True, Outcome.UNCERTAIN, "the pose is within the tolerance with a probability of {0:.0%}", True),
 )
 """Bounds on the evidence for a landmark-based pose, most serious first. The first bound does not apply to a pose found by other means."""
+
+
+def keeps_bound(measure: str, value: float) -> bool:
+    """Return whether a value satisfies the bound on a measure of landmark-based poses."""
+    return next(bound for bound in LANDMARK_BOUNDS if bound.measure == measure).keeps(value)
 
 
 def judge(evidence: Evidence, log_odds: float = 0.0) -> Verdict:

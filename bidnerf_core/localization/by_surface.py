@@ -93,7 +93,7 @@ def localize_by_depth(
         if float(compared.costs(refined).mean()) <= float(compared.costs(best).mean()) + 0.05:
             path = SE3.cat([path, *(T for T, _ in steps[1:]), refined.T])
             losses = torch.cat([losses, *(cost for _, cost in steps)])
-            best, inliers = refined, float(rays.agreement(refined)[0])
+            best, inliers = refined, float(rays.at(refined, derivatives=False).agreement()[0])
         measures = {**measure_support(compared, best), "rendered_inliers": inliers}
     T = best.T[0].normalized()
     covariance, precision = covariance_by_depth(problem, aligned, best, middle)
@@ -116,9 +116,9 @@ def localize_by_images(
     """Localize by comparing the images with renderings of the surface, in rounds until an answer is accepted.
 
     Each answer is refined on rays rendered from the field, unless too much of the image disagrees with the surface at all poses. If no
-    answer is accepted, the one with the smallest loss is returned.
+    answer is accepted, the one with the smallest loss is returned, of those whose search was completed if there are any.
     """
-    problem, answers = problem.without_depth(), list[Localization]()
+    problem, answers = problem.without_depth(), list[tuple[bool, bool, float, Localization]]()
     if all(is_blank(view.frame) for view in problem.views):
         why = Verdict(Outcome.UNDETERMINED, "the image has a single colour, as if the lens were covered")
         return without_pose(problem, why)
@@ -137,11 +137,12 @@ def localize_by_images(
             loss = float(found.scores[0])
             judged = Support({"image_inliers": 1 - loss / Images.INDEPENDENT})
             answer = conclude(problem, loop, found.path, found.losses, judged, "", loss, None)
-        answers.append(answer)
+        answers.append((answer.converged, found.complete, -answer.loss, answer))
         # Another round does not determine a focal length.
         if answer.outcome in (Outcome.CONVERGED, Outcome.IMPRECISE):
             break
-    return min(answers, key=lambda answer: (not answer.converged, answer.loss))
+    # The loss of a search that ended early is that of small images, on another scale.
+    return max(answers, key=lambda answer: answer[:3])[-1]
 
 
 def by_depth(problem: Problem, points: Surface, count: int, seed: int) -> SearchResult:

@@ -42,11 +42,8 @@ APPROXIMATE = (
 )
 """Hypotheses about a camera whose focal length is stated to be approximate, in the columns of ``STATED``."""
 # fmt: on
-OF_MAP = (
-    ("map", 0.0005, 0.0005, 0.0005, 0.0005, 0.0005, 0.0, 0.6),
-    ("map, about", 0.005, 0.005, 0.005, 0.005, 0.001, 0.0, 0.4),
-)
-"""Hypotheses that the camera is one of the map's: standard deviations about that camera, as in ``STATED``, and shares of its odds."""
+OF_MAP = (("map", 0.6), ("map, about", 0.4))
+"""Hypotheses that the camera is one of the map's, with the deviations of the first two rows of ``STATED``, and shares of its odds."""
 NEARLY = (0.002, 0.002, 0.002, 0.002, 0.001, 0.001)
 """Differences to be expected between two good calibrations of one camera, in the order of ``NUISANCES``."""
 SPURIOUS_MOTION = 0.002
@@ -95,9 +92,6 @@ class Explanations:
     credible: Bool[Tensor, "k"]  # whether a pose under it counts as right
     scatter: Float[Tensor, "N"]  # standard deviations of the spurious part of the nuisances
 
-    def __len__(self) -> int:
-        return len(self.cameras)
-
     @property
     def usual(self) -> Bool[Tensor, "k"]:
         """Mask of the explanations under which the stated camera, or one of the map's, is at least approximately right."""
@@ -116,7 +110,7 @@ class Explanations:
 
     def about(self, free: States) -> States:
         """Return one state for each explanation of each mode, with the poses of ``free`` (g) and the nuisances at their prior means."""
-        k, g = len(self), len(free)
+        k, g = len(self.cameras), len(free)
         index = torch.arange(g, device=free.z.device).repeat_interleave(k)
         row = torch.arange(k, device=free.z.device).repeat(g)
         z = free.z.new_zeros((g * k, N))
@@ -148,7 +142,10 @@ def explanations(
                 similar = bool((c.abs() <= torch.tensor((0.16, 0.06, 0.06, 0.2, 0.02, 0.01))).all())
                 # The prior odds that the image is from the map's camera depend on how much the stated one differs from it.
                 odds = 0.5 if similar else 0.05
-                rows += [(name, c.tolist(), deviation, share * odds, True) for name, *deviation, share in OF_MAP]
+                rows += [
+                    (name, c.tolist(), deviation, share * odds, True)
+                    for (name, share), (_, *deviation, _, _) in zip(OF_MAP, STATED, strict=False)
+                ]
     else:
         rows.append(("exact", [0.0] * 6, [0.0] * 6, 1.0, True))
     single = moving and len(query.images) == 1  # views of a rig may be from different times

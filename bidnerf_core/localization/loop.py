@@ -1,6 +1,6 @@
 """The loop: propose a pose, refine it under all explanations, fuse all measurements, and accept the pose or try the next one.
 
-``docs/methods.md#code`` lists which module does which step. A further kind of measurement becomes a term in ``Loop._fused``; it affects the
+``docs/methods.md#code`` lists which module does which step. A further kind of measurement becomes a term in ``Loop._fuse``; it affects the
 choice between places only through the ``log_odds`` there. Anything else that the image may be, such as a mirror image of the scene, becomes
 a mode in ``modes``, with a bound in ``accept``. ``propose`` has the proposals.
 """
@@ -21,7 +21,7 @@ from bidnerf_core.errors import enumeration
 from bidnerf_core.fields import has_field
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.localization.accept import Evidence, judge, same_pose
+from bidnerf_core.localization.accept import Evidence, judge, keeps_bound, same_pose
 from bidnerf_core.localization.explanations import CAMERAS, USUAL, Explanations, Proposal, explanations
 from bidnerf_core.localization.matching import (
     CELLS,
@@ -55,9 +55,9 @@ from bidnerf_core.localization.propose import (
     proposal_at,
     proposals_at,
 )
-from bidnerf_core.localization.result import Localization, Verdict, current_record
+from bidnerf_core.localization.result import Localization, Outcome, Verdict, current_record
 from bidnerf_core.localization.terms.images import Images, refine_on_small_images
-from bidnerf_core.localization.terms.rays import RenderedRays
+from bidnerf_core.localization.terms.rays import OUTLIER, RenderedRays
 from bidnerf_core.localization.terms.surface import Surface
 from bidnerf_core.mapping import CostTerm, Features, HeldOutTrial, LandmarkMap, Landmarks, States, true_intrinsics
 
@@ -79,7 +79,7 @@ class LandmarkAnswer:
     evidence: Evidence
     verdict: Verdict
     contradicted: bool  # whether hardly more landmarks match than by chance, although many should
-    fused: tuple[str, ...] = ()  # the measurements other than landmarks
+    fused: tuple[str, ...]  # the measurements other than landmarks
 
     @property
     def T_world_rig(self) -> SE3:
@@ -153,22 +153,30 @@ class Loop:
         places = {matcher.device} if problem is None else {matcher.device, problem.device}
         self.device = places.pop() if len(places) == 1 else torch.device("cpu")
         self._nearest: dict[int, Nearest] = {}
+        self._best: LandmarkAnswer | None = None
 
     @torch.no_grad()
     def __call__(self) -> LandmarkAnswer | None:
         """Return the best answer; None if no pose agrees with enough landmarks."""
-        best: LandmarkAnswer | None = None
         for proposal, nearest, nfa in self._proposals():
             answer = self.answer(proposal, nearest, nfa)
             if answer is not None and answer.verdict.accepted:
                 return answer
+            best = self._best
             if answer is not None and (best is None or answer.evidence.log10_nfa < best.evidence.log10_nfa):
-                best = answer
-        return best
+                self._best = answer
+        return self._best
 
     @torch.no_grad()
     def at(self, T_world_rig: SE3) -> LandmarkAnswer | None:
-        """Return the answer at a pose found by other means; None if too few landmarks match there."""
+        """Return the answer at a pose found by other means; None if too few landmarks match there.
+
+        It is the best answer of before if that has the same pose, which did not agree with landmarks by chance.
+        """
+        if (best := self._best) is not None and keeps_bound("log10_nfa", best.evidence.log10_nfa):
+            middle = torch.tensor([0.0, 0.0, best.distance], dtype=torch.float64)
+            if bool(same_pose(T_world_rig, best.T_world_rig[None], middle)):
+                return best
         proposal = proposal_at("elsewhere", T_world_rig, self.landmarks)
         return self.answer(proposal, self.nearest(STRONGEST), 0.0, searched=False)
 
@@ -183,9 +191,9 @@ class Loop:
             if not modes:
                 break
             states, term = run_on(self.device, weigh, states, term_of(modes, states, self.landmarks, self.device))
-            answer = self._fused(modes, states, term, given, searched)
+            answer = self._fuse(modes, states, term, given, searched)
             # If another place is the most probable one, the places that look like it compete with it, not those that look like the first.
-            if answer.posterior.mode == 0 or answer.mode.mirrored:
+            if answer.posterior.mode == 0 or answer.mode.mirrored or answer.verdict.outcome is Outcome.AMBIGUOUS:
                 break
             chosen, first, nfa = answer.posterior.chosen, answer.mode.by_descriptors, answer.evidence.log10_nfa
             proposal = Proposal(answer.mode.name, chosen.T[0], chosen.nuisances[0, :6], answer.distance)
@@ -215,7 +223,7 @@ class Loop:
         if self.problem is not None and (T := self.problem.start) is not None:
             yield from proposals_at(self.query, self.landmarks, T, extent_of(self.problem), nearest)
 
-    def _fused(
+    def _fuse(
         self, modes: list[Mode], best: States, landmarks: Landmarks, given: Explanations, searched: bool
     ) -> LandmarkAnswer:
         """Fuse all measurements under all explanations, and judge the result; rays are rendered only where they can change it."""
@@ -227,11 +235,10 @@ class Loop:
             terms.append(points)
             fused.append("depth")
             fit = run_on(self.device, fit_modes, fit.likeliest, terms, given, 5)
-            fit = replace(fit, log_odds=-run_on(self.device, cost_of, points, fit.about))
-            found = self._posterior(fit, landmarks, given)
+            found = self._posterior(fit, landmarks, given, -run_on(self.device, cost_of, points, fit.about))
             near, both = run_on(self.device, agreement, points, found.chosen)
             others |= {"on_surface": float(near), "colour_inliers": float(both)}
-        answer = self._judged(found, modes, landmarks, given, searched, others)
+        answer = self._judge(found, modes, landmarks, given, searched, others, tuple(fused))
         # The uncertainty of the projection of the scene, in pixels; rays are worth rendering above 0.6.
         blur = float(landmarks.focal.max()) * answer.evidence.precision / math.sqrt(HeldOutTrial.tails)
         # Also rendered: places and mirror images that are not much less probable; a mirror image at low resolution alone.
@@ -239,7 +246,7 @@ class Loop:
         places = [g for g in odds.argsort(descending=True).tolist() if odds[g] > 1e-3]
         which = torch.tensor([g for g in places if not modes[g].mirrored])
         if self.problem is None or not self.rays or blur <= 0.6 or not answer.evidence.is_open or not len(which):
-            return replace(answer, fused=tuple(fused))
+            return answer
         where = "cpu" if self.problem.device == self.device else None
         views, field, bounds = self.problem.views, self.problem.field, self.problem.bounds
         rays = RenderedRays.of(views, field, bounds, self.rays, self.seed, device=where, steep=True)
@@ -258,11 +265,10 @@ class Loop:
         # A place that was not rendered counts as if the map showed it as well as any other.
         log_odds = -Images.INDEPENDENT * loss.nan_to_num(float(loss.nan_to_num(torch.inf).amin()))
         systematic = (factor - 1)[:, None, None] * fit.by_rays[states.mode]
-        found = self._posterior(replace(fit, log_odds=log_odds, systematic=systematic), landmarks, given)
+        found = self._posterior(fit, landmarks, given, log_odds, systematic)
         if trial.difference > 0:
             others["difference"] = float(difference[found.mode])
-        answer = self._judged(found, modes, landmarks, given, searched, others)
-        return replace(answer, fused=(*fused, "rendering"))
+        return self._judge(found, modes, landmarks, given, searched, others, (*fused, "rendering"))
 
     def _points(self, state: States) -> Surface | None:
         """Return the term of the measured points with their noise at a state; None if there are too few, or hardly any lies on the surface."""
@@ -294,7 +300,7 @@ class Loop:
 
         The descent begins at the camera with which some rays agree best, of the most probable ones. The pose of a camera at rest that may
         be as stated is first refined on small images where rays would be too fine (``blur`` is in pixels). Where the rays agree clearly
-        less than usual, it begins again at each distinct camera.
+        less than usual, it begins again at each distinct camera, unless two places remain, between which no camera decides.
         """
         assert self.problem is not None
         likely = found.probability.argsort(descending=True)[:8]
@@ -311,7 +317,9 @@ class Loop:
         with_rays = self._settle(fit_with_rays, best, which, terms, rays, given, which)
         # On record, three of four right poses have rays that agree better.
         agrees = with_rays.loss <= 1.3 * self.landmarks.trial.difference
-        if self.landmarks.trial.difference == 0 or bool(agrees[which].all()):
+        share = (found.by_mode[which].log() - Images.INDEPENDENT * with_rays.loss[which]).softmax(0).amax()
+        is_ambiguous = not keeps_bound("other_place", 1 - float(share))
+        if self.landmarks.trial.difference == 0 or is_ambiguous or bool(agrees[which].all()):
             return with_rays
         worse, best = which[~agrees[which]], with_rays.likeliest
         for g in worse:
@@ -330,17 +338,27 @@ class Loop:
                 break
         return found
 
-    def _posterior(self, fit: ModeFits, landmarks: Landmarks, given: Explanations) -> Posterior:
-        """Return the posterior over the explanations; of two places that look the same, the one nearer to the start is likelier."""
+    def _posterior(
+        self,
+        fit: ModeFits,
+        landmarks: Landmarks,
+        given: Explanations,
+        log_odds: Float[Tensor, "g"] | float = 0.0,
+        systematic: Float[Tensor, "h P P"] | float = 0.0,
+    ) -> Posterior:
+        """Return the posterior over the explanations; of two places that look the same, the one nearer to the start is likelier.
+
+        ``log_odds`` and ``systematic`` are as for ``Posterior.of``.
+        """
         if self.problem is not None and (start := self.problem.start) is not None:
             update = (start.inverse() @ fit.quadratic.here.T).log()
             reach = proposal_at("start", start, self.landmarks).distance
             away = update[:, :3].norm(dim=-1) + reach * update[:, 3:].norm(dim=-1)
             # In six dimensions, the density of a normal distribution of unknown width falls with the sixth power of the distance.
-            fit = replace(fit, log_odds=fit.log_odds - 6.0 * away.clamp(min=1e-9).log())
-        return Posterior.of(fit, landmarks, given.scatter, self.device)
+            log_odds = log_odds - 6.0 * away.clamp(min=1e-9).log()
+        return Posterior.of(fit, landmarks, given.scatter, self.device, log_odds, systematic)
 
-    def _judged(
+    def _judge(
         self,
         found: Posterior,
         modes: list[Mode],
@@ -348,11 +366,12 @@ class Loop:
         given: Explanations,
         searched: bool,
         others: dict[str, float | None],
+        fused: tuple[str, ...],
     ) -> LandmarkAnswer:
-        """Judge the most probable pose; ``others`` is the evidence from measurements other than landmarks."""
+        """Judge the most probable pose; ``others`` is the evidence from the measurements ``fused`` with the landmarks."""
         mode, state = modes[found.mode], found.chosen
         query = mode.query
-        inlier = (term.residuals(state)[0][0] <= 9) & (term.valid[found.mode] > 0)
+        inlier = (term.residuals(state)[0][0] <= OUTLIER**2) & (term.valid[found.mode] > 0)
         count, distance = int(inlier.sum()), term.distance(state)
         within = RADII[-1] * query.threshold
         seen = Projected(query, self.landmarks, state, within)
@@ -368,9 +387,10 @@ class Loop:
         middle = torch.tensor([0.0, 0.0, distance], dtype=torch.float64)
         places = SE3.stack([found.place(g) for g in range(len(modes))])
         same = same_pose(state.T[0], places, middle) & ~torch.tensor([mode.mirrored for mode in modes])
-        # Two photos in one image are two places that different keypoints show.
+        # Two photos in one image are two places that different keypoints show: the first one, and one beside it.
         views = [m for m, near in zip(modes, same.tolist(), strict=True) if m.beside != mode.beside and not near]
-        other_view = max((m.besides(mode.matches) for m in views), default=None)
+        views = [m for m in views if m.beside or m is modes[0]]
+        other_view = max((m.count_unshared(mode.matches) for m in views), default=None)
         same = (found.states.mode == found.mode) | same[found.states.mode]
         agreeing = int(inliers(query, self.landmarks, mode.by_descriptors, state).sum())
         evidence = Evidence(
@@ -395,4 +415,4 @@ class Loop:
         if (record := current_record()) is not None:
             record.add(f"refined on {count} landmarks", found.pose())
         verdict = judge(evidence)
-        return LandmarkAnswer(modes, found, given, term, covariance, distance, evidence, verdict, contradicted)
+        return LandmarkAnswer(modes, found, given, term, covariance, distance, evidence, verdict, contradicted, fused)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
 from bidnerf_core.errors import InputError
@@ -30,7 +30,8 @@ class Method:
     uses_depth: bool = True  # whether it uses measured depth
     presets: Mapping[str, Any] = field(default_factory=dict)  # alternatives to the default settings, by name
     uses_landmarks: bool = False  # whether the map's landmarks are prepared for it, as ``Problem.matcher``
-    summary: str = field(kw_only=True)  # one line
+    _: KW_ONLY
+    summary: str  # one line
 
     def settings(self, preset: str | None = None) -> Any:
         """Return the default settings or those of a preset. Raises ``InputError`` for an unknown preset."""

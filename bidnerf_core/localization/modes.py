@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from bidnerf_core.devices import run_on
-from bidnerf_core.localization.accept import LANDMARK_BOUNDS
+from bidnerf_core.localization.accept import keeps_bound
 from bidnerf_core.localization.explanations import Explanations, Proposal
 from bidnerf_core.localization.matching import STRONGEST, LandmarkMatcher, Matches, Nearest, Projected, QueryKeypoints
 from bidnerf_core.localization.posterior import fit_landmarks, graduate
@@ -30,7 +30,7 @@ class Mode:
     mirrored: bool = False  # whether ``query`` is the mirror image
     beside: bool = False  # whether it explains keypoints that do not agree with the first place, as in a collage
 
-    def besides(self, others: Matches) -> int:
+    def count_unshared(self, others: Matches) -> int:
         """Return the number of matched keypoints that are not matched in ``others``."""
         return int((~torch.isin(self.matches.keypoint, others.keypoint)).sum())
 
@@ -72,18 +72,24 @@ class ModeSearch:
     def __call__(
         self, nearest: Nearest, matches: Matches, proposal: Proposal, nfa: float, searched: bool
     ) -> tuple[list[Mode], States]:
-        """Return the modes and the most probable state of each mode; no mode if too few matches agree with the proposal.
+        """Return the modes and the most probable state of each mode; no mode if not more matches agree with the proposal than by chance.
 
-        ``nfa`` is log10 of the number of false alarms of the proposal. If the proposal was ``searched`` for among the ``matches`` by
+        ``nfa`` is log10 of the number of false alarms of the proposal: above 0, as good a pose is expected of any image. If the proposal was ``searched`` for among the ``matches`` by
         descriptors, those that agree with it are used at first; otherwise, landmarks are matched by projection.
         """
-        first = self._agreeing(Mode(proposal.name, self.query, matches, matches), proposal, searched)
+        first = self._select_agreeing(Mode(proposal.name, self.query, matches, matches), proposal, searched)
+        none, by_chance = States.known(proposal.T, proposal.camera), nfa > 0
         if first is None:
-            return [], States.known(proposal.T, proposal.camera)
-        if searched:
-            first = first[0], self._warped(first[0], proposal, first[1])
-        others = (self._agreeing(mode, there, True) for mode, there in self._others(nearest, matches, nfa, first[1]))
+            return [], none
+        if searched and not by_chance:
+            first = first[0], self._fit_warp(first[0], proposal, first[1])
+        others = (
+            self._select_agreeing(mode, there, True)
+            for mode, there in self._propose_others(nearest, matches, nfa, first[1])
+        )
         modes, best = map(list, zip(first, *(other for other in others if other is not None), strict=True))
+        if by_chance and len(modes) == 1:
+            return [], none
         seen: list[Projected | None] = [None] * len(modes)
         for radius in RADII:
             for g, mode in enumerate(modes):
@@ -92,15 +98,15 @@ class ModeSearch:
                 matches = projected.matches(within)
                 if len(matches) >= LEAST_AGREEING:
                     modes[g] = mode = replace(mode, matches=matches)
-                best[g] = self._fitted(mode, best[g])
+                best[g] = self._fit(mode, best[g])
         # Matches by chance are no other view of the scene.
         first = modes[0].matches
-        some = [g for g, m in enumerate(modes) if not m.beside or m.besides(first) >= 0.3 * len(first)]
+        some = [g for g, m in enumerate(modes) if not m.beside or m.count_unshared(first) >= 0.3 * len(first)]
         return [modes[g] for g in some], States.cat(
             [replace(best[g], mode=best[g].mode + n) for n, g in enumerate(some)]
         )
 
-    def _agreeing(self, mode: Mode, proposal: Proposal, searched: bool) -> tuple[Mode, States] | None:
+    def _select_agreeing(self, mode: Mode, proposal: Proposal, searched: bool) -> tuple[Mode, States] | None:
         """Return a mode with the matches that agree with a proposal, and its most probable state; None if too few agree."""
         known, within = States.known(proposal.T, proposal.camera), RADII[0] * mode.query.threshold
         if searched:
@@ -112,19 +118,20 @@ class ModeSearch:
             return None
         mode = replace(mode, matches=matches)
         # With few matches, a model about the free fit is not accurate at the camera that is chosen, so that it is fitted again.
-        return mode, self._fitted(mode, self._fitted(mode, self._free(proposal)))
+        return mode, self._fit(mode, self._fit(mode, self._free_camera(proposal)))
 
-    def _free(self, proposal: Proposal) -> States:
+    def _free_camera(self, proposal: Proposal) -> States:
         """Return the state of a proposal under the explanation that leaves the camera the most freedom."""
         widest = self.given.widest
         state = States.known(proposal.T, proposal.camera).under(self.given.mean[widest], self.given.deviation[widest])
         return replace(state, row=state.row + widest)
 
-    def _fitted(self, mode: Mode, state: States) -> States:
+    def _fit(self, mode: Mode, state: States) -> States:
         """Return the most probable state of a mode, fitted to its matches from a state of any camera."""
-        return run_on(self.device, fit_landmarks, state, self._term(mode, state), self.given).likeliest
+        term = term_of([mode], state, self.matcher.landmarks, self.device)
+        return run_on(self.device, fit_landmarks, state, term, self.given).likeliest
 
-    def _warped(self, mode: Mode, proposal: Proposal, best: States) -> States:
+    def _fit_warp(self, mode: Mode, proposal: Proposal, best: States) -> States:
         """Return the fit of a camera that explains any warp of the image if many more matches agree with that fit, else ``best``.
 
         In a sheared image, or a photo of a picture, consensus finds only the matches that happen to agree with a usual camera. From
@@ -134,11 +141,14 @@ class ModeSearch:
         agreeing = int(inliers(query, self.matcher.landmarks, found, best).sum())
         if agreeing >= 0.7 * len(found):
             return best
-        state = run_on(self.device, graduate, self._free(proposal), self._term(replace(mode, matches=found), best))
+        term = term_of([replace(mode, matches=found)], best, self.matcher.landmarks, self.device)
+        state = run_on(self.device, graduate, self._free_camera(proposal), term)
         more = int(inliers(query, self.matcher.landmarks, found, state).sum())
         return state if more > 1.3 * agreeing else best
 
-    def _others(self, nearest: Nearest, matches: Matches, nfa: float, best: States) -> Iterator[tuple[Mode, Proposal]]:
+    def _propose_others(
+        self, nearest: Nearest, matches: Matches, nfa: float, best: States
+    ) -> Iterator[tuple[Mode, Proposal]]:
         """Yield the hypotheses that compete with the place of the state ``best``.
 
         A scene may be repetitive, such as two rooms with the same furniture: keypoints that agree with the state may agree as well with
@@ -167,8 +177,5 @@ class ModeSearch:
             modes.append(Mode("mirror image", query.mirrored, matches, matches, mirrored=True))
         for mode in modes:
             other = consensus(mode.query, landmarks, mode.by_descriptors, best.nuisances[0, :6], mode.name)
-            if other is not None and (not mode.beside or LANDMARK_BOUNDS[0].keeps(other[1])):
+            if other is not None and (keeps_bound("log10_nfa", other[1]) or not (mode.beside or nfa > 0)):
                 yield mode, other[0]
-
-    def _term(self, mode: Mode, state: States) -> Landmarks:
-        return term_of([mode], state, self.matcher.landmarks, self.device)

@@ -51,9 +51,6 @@ class ModeFits:
     # NaN and 0 where none were rendered
     loss: Float[Tensor, "g"]
     by_rays: Float[Tensor, "g P P"]
-    log_odds: Float[Tensor, "g"] | float = 0.0  # between the modes, from measurements other than landmarks
-    # scatter of the gradients of each state (in the units of the models) beyond that of independent errors
-    systematic: Float[Tensor, "h P P"] | float = 0.0
 
     @property
     def likeliest(self) -> States:
@@ -80,19 +77,22 @@ class Posterior:
         landmarks: Landmarks,
         scatter: Float[Tensor, "N"],
         device: torch.device = torch.device("cpu"),  # noqa: B008
+        log_odds: Float[Tensor, "g"] | float = 0.0,
+        systematic: Float[Tensor, "h P P"] | float = 0.0,
     ) -> Posterior:
-        """Compare explanations within a mode by their weights, and modes by the evidence of ``landmarks`` and their prior log odds.
+        """Compare explanations within a mode by their weights, and modes by the evidence of ``landmarks`` and their other ``log_odds``.
 
-        ``scatter`` are the standard deviations of the spurious part of the nuisances. Most of the computation runs on ``device``.
+        ``scatter`` are the standard deviations of the spurious part of the nuisances; ``systematic`` is the scatter of the gradients of
+        each state (in the units of the models) beyond that of independent errors. Most of the computation runs on ``device``.
         """
         states, normal, weights = fit.states, fit.normal, fit.weights
-        by_mode, information = run_on(device, _information, states, normal, fit.quadratic, landmarks, fit.systematic)
+        by_mode, information = run_on(device, _information, states, normal, fit.quadratic, landmarks, systematic)
         member = states.mode[None] == torch.arange(len(fit.about))[:, None]
         norm = torch.where(member, weights[None], -torch.inf).logsumexp(-1)
         # The log odds between places do not grow in proportion to the number of matches, since the right place rarely has fewer than
         # two thirds as many as another: a factor of e in the evidence adds ten. Below an evidence of 50, places are not compared, since
         # a few chance matches are no evidence against even fewer.
-        log = weights + (fit.log_odds + 10.0 * by_mode.clamp(min=50.0).log() - norm)[states.mode]
+        log = weights + (log_odds + 10.0 * by_mode.clamp(min=50.0).log() - norm)[states.mode]
         # Finite, so that explanations none of which is determined are equally probable.
         probability = log.nan_to_num(-1e300, neginf=-1e300).softmax(0)
         best = int(probability.argmax())
@@ -309,7 +309,7 @@ def fit_with_rays(
     here, _ = descend(best[which], [*terms, rays], 4)
     about = best.with_rows(which, here)
     plain = linearize_modes(about, terms, given)
-    compared = rays.at(move_to(plain.here[which], rays.rgb.device))
+    compared = rays.at(plain.here[which])
     by_rays = Quadratic.of(move_to(compared.normal(), best.z.device), plain.here[which])
     quadratic = plain.with_rows_added(which, by_rays)
     states, normal = quadratic.minimum(given.about(quadratic.here))

@@ -155,7 +155,7 @@ def localization_by_rays(
     """
     some = States.cat([found.before, found.states[:1]])
     best = some[fresh.costs(some).sum(-1).argmin()[None]]
-    T, here = best.T[0].normalized(), fresh.at(move_to(best, fresh.rgb.device))
+    T, here = best.T[0].normalized(), fresh.at(best)
     rays = replace(fresh, noise=here.fitted_noise(), independent=ALONE * len(problem.views))
     normal = move_to(replace(here, term=rays).normal(), "cpu")
     covariance = torch.linalg.inv_ex(normal.hessian[0, :6, :6]).inverse
@@ -163,10 +163,7 @@ def localization_by_rays(
     # The step as the shift of the visible scene, relative to its distance, and the rotation (radians).
     step = -damped_solution(normal, torch.zeros_like(normal.cost))[0, :6]
     shift = SE3.exp(step).apply(middle) - middle
-    measures: dict[str, float | None] = {"plain": 0.0, "confidence": 0.25}
-    if T.is_finite:
-        costs = fresh.plain_costs()
-        measures = support(lambda T: fresh.costs(states_at(T)), T, middle, costs, found.rivals.T)
+    measures = support(lambda T: fresh.costs(states_at(T)), T, middle, fresh.plain_costs(), found.rivals.T)
     agreement, by_colour = float(here.agreement()[0]), fresh.depth_loss is None and problem.colour_noise
     measures |= {
         "determined": float(determined),
@@ -187,14 +184,14 @@ def conclude(
     loop: Loop | None,
     path: SE3,
     losses: Float[Tensor, "s"],
-    support: Support,
+    judged: Support,
     accepted: str,
     loss: float,
     covariance: Float[Tensor, "6 6"] | None,
 ) -> Localization:
-    """Return the answer at the end of a search's ``path``: that of the landmarks there if they accept it, else that of its ``support``.
+    """Return the answer at the end of a search's ``path``: that of the landmarks there if they accept it, else that of its measures.
 
-    The path begins at the start, if there is one. ``accepted`` is the reason if the support suffices.
+    The path begins at the start, if there is one. ``accepted`` is the reason if they suffice.
     """
     began, there = time.perf_counter(), None if loop is None else loop.at(path[-1])
     if there is not None and there.verdict.accepted:
@@ -206,9 +203,9 @@ def conclude(
         "confirmed": None if there is None else float(not there.contradicted),
         "known_focal": float(by_rays or not problem.focal_is_approximate),
     }
-    support = replace(support, measures=support.measures | more)
+    judged = replace(judged, measures=judged.measures | more)
     path = path if problem.start is None else SE3.cat([problem.start[None], path[1:]])
-    return Localization.of(support.verdict(accepted), path, losses, "auto", began, loss, covariance, support)
+    return Localization.of(judged.verdict(accepted), path, losses, "auto", began, loss, covariance, judged)
 
 
 def without_pose(problem: Problem, why: Verdict) -> Localization:

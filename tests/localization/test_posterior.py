@@ -209,7 +209,7 @@ def test_prior_odds_and_evidence_of_landmarks_decide_between_places() -> None:
         modes, _ = descend(modes, [given], 8)
         quadratic = Quadratic.of(total(modes, [given]) - prior(modes), modes)
         log_odds = torch.tensor([0.0, odds], dtype=torch.float64)
-        found = Posterior.of(replace(fitted(quadratic, modes), log_odds=log_odds), given, NO_SCATTER)
+        found = Posterior.of(fitted(quadratic, modes), given, NO_SCATTER, log_odds=log_odds)
         probability[name] = float(found.probability[found.states.mode == 1].sum())
         assert bool((found.place(1).translation - modes.T[1].translation).norm() < 0.05)
     assert probability["alike"] == pytest.approx(0.5, abs=1e-3)

@@ -5,19 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 NEARLY_CLIPPED = 0.01
 """Distance from black or white, in [0, 1], within which an image's colours may be clipped."""
-
-
-def clipped(seen: Float[Tensor, "*s"], measured: Float[Tensor, "#*s"]) -> Bool[Tensor, "*s"]:
-    """Return the mask of colours that are clipped in the image and out of range in the exposed rendering ``seen``.
-
-    Such colours agree with the exposure whatever the difference, but do not constrain it.
-    """
-    return ((measured > 1 - NEARLY_CLIPPED) & (seen >= 1)) | ((measured < NEARLY_CLIPPED) & (seen <= 0))
 
 
 def fit_exposure(
@@ -39,7 +31,10 @@ def fit_exposure(
     for number in range(rounds):
         if number > 0:
             corrected = gain * seen + offset
-            weight = known * weigh(corrected - measured) * ~clipped(corrected, measured)
+            # Colours that are clipped in the image and out of range in the rendering agree, but do not constrain the exposure.
+            white = (measured > 1 - NEARLY_CLIPPED) & (corrected >= 1)
+            black = (measured < NEARLY_CLIPPED) & (corrected <= 0)
+            weight = known * weigh(corrected - measured) * ~(white | black)
         difference = measured - seen
         total = weight.sum(1, keepdim=True) + precision[1]
         mean, shift = ((weight * part).sum(1, keepdim=True) for part in (seen, difference))

@@ -51,14 +51,11 @@ def field_renderer(field: RadianceField, bounds: SceneBounds) -> Renderer:
 
     @torch.no_grad()
     def rendered(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        parts = []
-        for o, d in zip(origins.split(2**14), directions.split(2**14), strict=True):
-            seen = render(field, bounds.rays(o, d), bounds.background)
-            passing = ((constant(bounds.centre, o) - o) * d).sum(-1)
-            met = seen.distance / seen.opacity.clamp(min=0.5)
-            parts.append((seen.rgb, torch.where(seen.opacity > 0.5, met, passing).clamp(min=bounds.near)))
-        rgb, along = (torch.cat(part) for part in zip(*parts, strict=True))
-        return rgb, torch.ones_like(along), along
+        seen = render(field, bounds.rays(origins, directions), bounds.background)
+        passing = ((constant(bounds.centre, origins) - origins) * directions).sum(-1)
+        met = seen.distance / seen.opacity.clamp(min=0.5)
+        along = torch.where(seen.opacity > 0.5, met, passing).clamp(min=bounds.near)
+        return seen.rgb, torch.ones_like(along), along
 
     return rendered
 

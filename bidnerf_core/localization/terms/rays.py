@@ -30,7 +30,7 @@ from bidnerf_core.mapping import MOTION, Normal, Sights, States, rays_by_camera,
 ALONE = 10.0
 """Maximum number of independent measurements that rays amount to, if there are no others and the pose may be far off."""
 OUTLIER = 3.0
-"""Residual, in scales of the loss, beyond which a ray disagrees with the rendering."""
+"""Residual, in standard deviations or in scales of its loss, beyond which a measurement disagrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,10 +130,11 @@ class RenderedRays:
         return replace(self, **{name: getattr(self, name)[some] for name in ("sights", "rgb", "coloured", "distance")})
 
     def __call__(self, states: States) -> Normal:
-        return move_to(self.at(move_to(states, self.rgb.device)).normal(), states.z.device)
+        return move_to(self.at(states).normal(), states.z.device)
 
     def at(self, states: States, derivatives: bool = True) -> ComparedRays:
-        """Render the rays at ``states``, which are on the field's device, and compare them with the measurements."""
+        """Render the rays at ``states``, and compare them with the measurements, on the field's device."""
+        states = move_to(states, self.rgb.device)
         if derivatives:
             return ComparedRays(self, *self._residuals(states))
         *_, origins, directions = self._sent(states)
@@ -144,16 +145,12 @@ class RenderedRays:
 
     def costs(self, states: States) -> Float[Tensor, "h n"]:
         """Return each ray's robust loss, divided by the variance of the noise, without derivatives."""
-        found = self.at(move_to(states, self.rgb.device), derivatives=False)
+        found = self.at(states, derivatives=False)
         return (self._robust(found.value)[0] / self.noise**2).to(states.z.device)
 
     def loss_at(self, states: States) -> Float[Tensor, "h"]:
         """Return the mean robust loss of a ray, in squares of the loss's scale, without derivatives."""
-        return self.at(move_to(states, self.rgb.device), derivatives=False).loss().to(states.z)
-
-    def agreement(self, states: States) -> Float[Tensor, "h"]:
-        """Return the fraction of the rays whose colours and distances agree with the rendering."""
-        return self.at(move_to(states, self.rgb.device), derivatives=False).agreement().to(states.z.device)
+        return self.at(states, derivatives=False).loss().to(states.z)
 
     def plain_costs(self) -> Float[Tensor, "n"] | None:
         """Return each ray's ``costs``, on the CPU, as if all rays had been rendered in the single colour that fits best.
@@ -169,7 +166,7 @@ class RenderedRays:
 
     def fitted(self, states: States) -> RenderedRays:
         """Return the term with its noise estimated from the scatter of the rays' gradients at the first state."""
-        return replace(self, noise=self.at(move_to(states[:1], self.rgb.device)).fitted_noise())
+        return replace(self, noise=self.at(states[:1]).fitted_noise())
 
     @property
     def _depth_unit(self) -> float:

@@ -147,7 +147,14 @@ class Surface:
             residuals = torch.cat([residuals, difference.double()], -1)
             slopes = torch.cat([slopes, slope.double()], -2)
             weights = torch.stack([by_distance, *3 * [by_colour]], -1)
-        rows = self._rows(here, slopes, local, rays, rig).flatten(1, 2)
+        # The derivatives of the points (world) along the normals, and along the changes of colour, by the unknowns.
+        by_rig = (slopes.flatten(1, 2) @ here.T.rotation).view_as(slopes)
+        own = by_rig @ self.sights.rotation
+        scale = (self.z * here.nuisances[:, DEPTH, None].exp())[..., None, None]
+        by_camera = own @ (rays_by_camera(rays, here) * scale)
+        by_motion = -by_update(own, local) * self.sights.times[:, None, None] * here.deviation[:, None, None, MOTION]
+        by_depth = own @ (local - self.fixed)[..., None] * here.deviation[:, None, None, DEPTH:]
+        rows = torch.cat([-by_update(by_rig, rig), by_camera, by_motion, by_depth], -1).flatten(1, 2)
         weighted = (rows * weights.flatten(1)[..., None]).mT
         gradient = (weighted @ residuals.flatten(1)[..., None])[..., 0]
         return move_to(Normal(cost, gradient, weighted @ rows), states.z.device)
@@ -231,17 +238,3 @@ class Surface:
         # A point farther from a surfel than its radius, 1.5 cells, does not lie on the surface.
         beyond = (along.norm(dim=-1) - 1.5 * self.surface.cell).clamp(min=0)
         return across, across.square() + beyond.square(), normal, index, along, local, rays, rig
-
-    def _rows(
-        self, states: States, normals: Float[Tensor, "h n k 3"], local: Tensor, rays: Tensor, rig: Tensor
-    ) -> Float[Tensor, "h n k P"]:
-        """Return the derivatives of the points (world) along ``normals`` with respect to the unknowns."""
-        sights = self.sights
-        by_rig = (normals.flatten(1, 2) @ states.T.rotation).view_as(normals)
-        own = by_rig @ sights.rotation
-        scale = (self.z * states.nuisances[:, DEPTH, None].exp())[..., None, None]
-        by_camera = own @ (rays_by_camera(rays, states) * scale)
-        times = sights.times[:, None, None]
-        by_motion = -by_update(own, local) * times * states.deviation[:, None, None, MOTION]
-        by_depth = own @ (local - self.fixed)[..., None] * states.deviation[:, None, None, DEPTH:]
-        return torch.cat([-by_update(by_rig, rig), by_camera, by_motion, by_depth], -1)

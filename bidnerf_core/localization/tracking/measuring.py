@@ -16,7 +16,7 @@ from bidnerf_core.depth import DepthSensorModel
 from bidnerf_core.fields import has_field
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import CORNERS_PER_INDEPENDENT, SE3, skew, update_between
-from bidnerf_core.localization.accept import Evidence, Support, judge
+from bidnerf_core.localization.accept import Evidence, Support, judge, keeps_bound
 from bidnerf_core.localization.auto import within_limits
 from bidnerf_core.localization.explanations import STATED, Explanations, motion_prior
 from bidnerf_core.localization.loop import DEPTH_WIDTH
@@ -58,8 +58,8 @@ from bidnerf_core.mapping import (
 
 ENOUGH_LANDMARKS = 40
 """Minimum number of tracked inliers: with fewer, landmarks are recognised anew, and a pose by tracked ones alone is rejected."""
-LEAST_CORNERS, SIGNIFICANT_NFA = 20, -6.0
-"""Minimum number of corners that agree on a motion (at least half of all must), and maximum log10 of the motion's false alarms."""
+LEAST_CORNERS = 20
+"""Minimum number of corners that agree on a motion; at least half of all must, so that it is never by chance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +155,7 @@ class Measurer:
         assert self.features is not None
         camera, T = frame.intrinsics, predicted.T_world_camera
         radius = search_radius(camera, predicted.covariance, predicted.reach)
-        if tracked is not None and tracked.log10_nfa <= SIGNIFICANT_NFA and tracked.is_accurate:
+        if tracked is not None and keeps_bound("log10_nfa", tracked.log10_nfa) and tracked.is_accurate:
             T, radius = tracked.states.T[0], 0.0
         if radius is None:
             return None
@@ -306,7 +306,7 @@ class Measurer:
             rays = replace(rays, independent=ALONE)
             for _ in range(2):
                 states, normal = descend(states, [prediction, rays.fitted(states)], 2)
-            share = float(rays.agreement(states))
+            share = float(rays.at(states, derivatives=False).agreement())
             measures: dict[str, float | None] = {"new_inliers": share}
             words = f"{share:.0%} of the rays have the rendered colours"
         else:
@@ -349,7 +349,7 @@ class Measurer:
         fit = Fit.of(corners, frame.intrinsics, predicted.T_world_camera, CORNERS_PER_INDEPENDENT)
         few = fit.agreeing < max(LEAST_CORNERS, 0.5 * len(corners))
         relative, singular = torch.linalg.inv_ex(fit.term(fit.states).hessian[0, :6, :6])
-        if few or fit.log10_nfa > SIGNIFICANT_NFA or bool(singular):
+        if few or bool(singular):
             return None
         relative = (relative + relative.T) / 2
         return motion.move(fit.states.T[0], relative, seconds), corners[fit.is_inlier]

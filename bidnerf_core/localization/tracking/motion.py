@@ -71,8 +71,7 @@ class Motion:
     noise: Float[Tensor, "12 12"]  # covariance of pose and velocity
     bias: Float[Tensor, "6 6"]  # covariance of the pose error shared by frames
     reach: float  # metres: distance to the visible scene, which scales translations
-    # factor on the acceleration: how briskly the camera has recently changed its velocity
-    agility: float = 1.0
+    agility: float  # factor on the acceleration: how briskly the camera has recently changed its velocity
 
     @staticmethod
     def at(pose: PoseEstimate, reach: float) -> Motion:
@@ -81,7 +80,7 @@ class Motion:
         noise[:6, :6] = pose.noise
         # An unknown velocity has a standard deviation of one reach, and of one radian, per second.
         noise[6:, 6:] = _diagonal(reach, 1.0)
-        return Motion(pose.T_world_camera, torch.zeros(6, dtype=torch.float64), noise, pose.bias, reach)
+        return Motion(pose.T_world_camera, torch.zeros(6, dtype=torch.float64), noise, pose.bias, reach, 1.0)
 
     @property
     def covariance(self) -> Float[Tensor, "6 6"]:

@@ -24,14 +24,13 @@ from bidnerf_core.frames import Frame, visible_at
 from bidnerf_core.geometry import SE3
 from bidnerf_core.localization.matching import cells, inlier_threshold, log10_nfa
 from bidnerf_core.localization.propose import from_poselib, poselib_camera, to_poselib
+from bidnerf_core.localization.terms.rays import OUTLIER
 from bidnerf_core.mapping import FIRST_CENTRE, LandmarkMap, Landmarks, Sights, States, measured_depth, point_variance
 
 POINTS = 400
 """Maximum number of landmarks, corners or measured pixels that are tracked or aligned."""
 FRESH = -1
 """Landmark number of points that are not landmarks."""
-INLIER = 3.0
-"""Maximum deviation of an inlier, in standard deviations."""
 FLOW: dict[str, Any] = {
     "winSize": (13, 13),  # pixels: of the compared patches
     "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
@@ -184,7 +183,7 @@ class Fit:
 
     @property
     def is_inlier(self) -> Bool[Tensor, "m"]:
-        return self._residuals[0] <= INLIER
+        return self._residuals[0] <= OUTLIER
 
     @property
     def agreeing(self) -> int:
