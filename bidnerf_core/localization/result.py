@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -246,7 +246,7 @@ class _Saved:
     focal_factor: float | None
     intrinsics: Intrinsics | None
     confidence: float | None
-    unit: LengthUnit = "units"
+    unit: LengthUnit
 
 
 def _matrix(rows: list[list[float]], size: int, what: str, where: str) -> Float[Tensor, "n n"]:
@@ -275,8 +275,8 @@ class RecordedStep:
 class SearchRecord:
     """The steps of a search and the landmark-based answers, in order."""
 
-    steps: list[RecordedStep] = field(default_factory=list)
-    answers: list[LandmarkAnswer] = field(default_factory=list)
+    steps: list[RecordedStep]
+    answers: list[LandmarkAnswer]
 
     def add(self, caption: str, T: SE3, scores: Float[Tensor, "h"] | None = None, passing: int = 1) -> None:
         """Record poses T (h) or a single pose; without scores, the poses must be sorted, best first."""
@@ -294,7 +294,7 @@ _RECORD: ContextVar[SearchRecord | None] = ContextVar("record", default=None)
 @contextmanager
 def record_search() -> Iterator[SearchRecord]:
     """Yield a record that collects the steps and answers of this thread's localizations within the block."""
-    token = _RECORD.set(record := SearchRecord())
+    token = _RECORD.set(record := SearchRecord([], []))
     try:
         yield record
     finally:
