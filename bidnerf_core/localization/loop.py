@@ -299,8 +299,9 @@ class Loop:
         """Fit rays as well, for the modes ``which``; ``fit`` and its posterior ``found`` are without them.
 
         The descent begins at the camera with which some rays agree best, of the most probable ones. The pose of a camera at rest that may
-        be as stated is first refined on small images where rays would be too fine (``blur`` is in pixels). Where the rays agree clearly
-        less than usual, it begins again at each distinct camera, unless two places remain, between which no camera decides.
+        be as stated is first refined on small images where rays would be too fine (``blur`` is in pixels). Several places are compared on few
+        rays first, which suffice where the field shows them alike. Where the rays agree clearly less than usual, the descent begins again
+        at each distinct camera.
         """
         assert self.problem is not None
         likely = found.probability.argsort(descending=True)[:8]
@@ -314,12 +315,14 @@ class Loop:
                 coarse = refine_on_small_images(self.problem, here, blur)
                 here = coarse if float(few.loss_at(coarse)) < float(loss[first]) else here
             best = best.with_rows(g[None], here)
-        with_rays = self._settle(fit_with_rays, best, which, terms, rays, given, which)
+        for term in (few, rays)[len(which) == 1 :]:
+            with_rays = self._settle(fit_with_rays, best, which, terms, term, given, which)
+            share = (found.by_mode[which].log() - Images.INDEPENDENT * with_rays.loss[which]).softmax(0).amax()
+            if not keeps_bound("other_place", 1 - float(share)):
+                return with_rays
         # On record, three of four right poses have rays that agree better.
         agrees = with_rays.loss <= 1.3 * self.landmarks.trial.difference
-        share = (found.by_mode[which].log() - Images.INDEPENDENT * with_rays.loss[which]).softmax(0).amax()
-        is_ambiguous = not keeps_bound("other_place", 1 - float(share))
-        if self.landmarks.trial.difference == 0 or is_ambiguous or bool(agrees[which].all()):
+        if self.landmarks.trial.difference == 0 or bool(agrees[which].all()):
             return with_rays
         worse, best = which[~agrees[which]], with_rays.likeliest
         for g in worse:
