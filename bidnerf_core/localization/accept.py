@@ -395,10 +395,7 @@ def support(
     against["displaced"] = float(log_odds(costs(many.retract_about(middle, steps)), here).min())
     if others is not None and len((far := others[~same_pose(T, others, middle)]).translation):
         against["other"] = float(log_odds(costs(far), here).min())
-    explained = None
-    if plain is not None:
-        total = float(plain.sum())
-        explained = max(0.0, 1 - float(here.sum()) / total) if total > 0 else 0.0
+    explained = None if plain is None else max(0.0, 1 - float(here.sum() / plain.sum()))
     # The posterior probability of the pose, with equal prior odds against each rival.
     confidence = 1 / (1 + sum(odds(-each) for each in against.values()))
     return {**against, "confidence": confidence, "explained": explained}

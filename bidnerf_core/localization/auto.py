@@ -35,9 +35,8 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     """
     began = time.perf_counter()
     problem = replace(problem, sensor=find_depth_sensor(config.depth_sensor))
-    loop = None
-    if problem.matcher is not None and config.landmarks:
-        loop = Loop(problem.views, problem.matcher, problem, config.fused_rays, seed)
+    matcher = problem.matcher if config.landmarks else None
+    loop = None if matcher is None else Loop(problem.views, matcher, problem, config.fused_rays, seed)
     best: Localization | None = None
     for found in answers(problem, config, seed, loop):
         best = found if best is None or is_better(found, best) else best
@@ -58,9 +57,8 @@ def answers(problem: Problem, config: AutoConfig, seed: int, loop: Loop | None) 
     """
     surface = problem.surface
     if loop is not None:
-        began = time.perf_counter()
         if (answer := loop()) is not None:
-            yield answer.localization(problem, began)
+            yield answer.localization(problem, time.perf_counter())
     elif surface is None:
         why = "the map has no surface ('bidnerf bake' makes one)"
         if problem.start is None:

@@ -96,7 +96,15 @@ def localize_by_depth(
             best, inliers = refined, float(rays.at(refined, derivatives=False).agreement()[0])
         measures = {**measure_support(compared, best), "rendered_inliers": inliers}
     T = best.T[0].normalized()
-    covariance, precision = covariance_by_depth(problem, aligned, best, middle)
+    # In directions that the points do not constrain, such as along a bare wall, the standard deviation is the size of the scene or half a
+    # turn. The precision is without the uncertainties of the sensor's scale and offset, which all points share.
+    unconstrained = torch.tensor([surface.extent] * 3 + [math.pi] * 3, dtype=torch.float64)
+    anywhere = GaussianPrior(best.T[0], unconstrained.square().reciprocal().diag())
+    covariance = torch.linalg.inv((aligned(best) + anywhere(best)).hessian[0, :6, :6])
+    precision = float(covariance[:3, :3].trace().sqrt() / middle.norm())
+    sight = normalize((points.points - points.sights.translation).cpu(), dim=-1).mean(0)
+    shared = torch.stack([problem.sensor.scale * middle, problem.sensor.offset * sight], -1)
+    covariance[:3, :3] += shared @ shared.mT
     rivals = support(lambda T: finest.costs(states_at(T)), T, middle)
     # With the right camera, landmarks should confirm the pose; where they do not, only a precise alignment is accepted.
     measures |= {
@@ -107,7 +115,7 @@ def localize_by_depth(
     words = f"{measures['colour_inliers']:.0%} of the measured points match the surface in position and colour"
     loss = float(compared.costs(best).mean())
     path = SE3.cat([path[:-1], T[None]])
-    return conclude(problem, loop, path, losses, Support(measures), words, loss, covariance)
+    return conclude(problem, loop, path, losses, Support(measures), words, loss, (covariance + covariance.mT) / 2)
 
 
 def localize_by_images(
@@ -246,22 +254,3 @@ def measure_support(points: Surface, best: States) -> dict[str, float | None]:
     early = hit < length - max(2 * ON_SURFACE * surface.extent, 4 * surface.cell)
     shares = {"on_surface": near, "colour_inliers": both, "free_space_violations": early.double()}
     return {name: float(share.mean()) for name, share in shares.items()}
-
-
-def covariance_by_depth(
-    problem: Problem, points: Surface, best: States, middle: Float[Tensor, "3"]
-) -> tuple[Float[Tensor, "6 6"], float]:
-    """Return the positive definite covariance of a pose that aligns measured points with the surface, and the pose's precision.
-
-    In directions that the points do not constrain, such as along a bare wall, the standard deviation is the size of the scene
-    or half a turn. The uncertainties of the sensor's scale and offset, which all points share, are added. The precision is the standard
-    deviation of the position without these shared errors, relative to the distance of the points.
-    """
-    unconstrained = torch.tensor([points.surface.extent] * 3 + [math.pi] * 3, dtype=torch.float64)
-    anywhere = GaussianPrior(best.T[0], unconstrained.square().reciprocal().diag())
-    found = torch.linalg.inv((points(best) + anywhere(best)).hessian[0, :6, :6])
-    precision = float(found[:3, :3].trace().sqrt() / middle.norm())
-    sight = normalize((points.points - points.sights.translation).cpu(), dim=-1).mean(0)
-    shared = torch.stack([problem.sensor.scale * middle, problem.sensor.offset * sight], -1)
-    found[:3, :3] += shared @ shared.mT
-    return (found + found.mT) / 2, precision

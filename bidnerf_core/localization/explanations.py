@@ -127,7 +127,7 @@ def explanations(
     scale of measured depth. Images from different cameras are explained only by their stated intrinsics.
     """
     # For each explanation: its name, the mean corrections of the camera and their deviations, its probability, and whether it is credible.
-    rows = list[tuple[str, list[float], list[float], float, bool]]()
+    rows: list[tuple[str, list[float], list[float], float, bool]] = [("exact", [0.0] * 6, [0.0] * 6, 1.0, True)]
     if query.has_one_camera:
         known = cameras_of_map(query, landmarks)
         nearly = torch.tensor(NEARLY, dtype=torch.float64)
@@ -146,8 +146,6 @@ def explanations(
                     (name, c.tolist(), deviation, share * odds, True)
                     for (name, share), (_, *deviation, _, _) in zip(OF_MAP, STATED, strict=False)
                 ]
-    else:
-        rows.append(("exact", [0.0] * 6, [0.0] * 6, 1.0, True))
     single = moving and len(query.images) == 1  # views of a rig may be from different times
     share_moving, motion = motion_prior(landmarks, distance)
     kinds = [(False, [0.0] * 6, 1 - share_moving * single), (True, motion, share_moving)]

@@ -146,9 +146,8 @@ class Loop:
         self.matcher, self.problem, self.seed, self.moving = matcher, problem, seed, moving
         self.landmarks: LandmarkMap = matcher.landmarks
         self.query = QueryKeypoints.of(views, features or matcher.features)
-        noise = None if problem is None else problem.colour_noise
         # The rays of a field with more colour noise on its training images add nothing to the landmarks.
-        shows = problem is not None and has_field(problem.field) and (noise is None or noise <= 0.04)
+        shows = problem is not None and has_field(problem.field) and (problem.colour_noise or 0.0) <= 0.04
         self.rays = rays if shows else 0
         places = {matcher.device} if problem is None else {matcher.device, problem.device}
         self.device = places.pop() if len(places) == 1 else torch.device("cpu")
@@ -391,8 +390,8 @@ class Loop:
         places = SE3.stack([found.place(g) for g in range(len(modes))])
         same = same_pose(state.T[0], places, middle) & ~torch.tensor([mode.mirrored for mode in modes])
         # Two photos in one image are two places that different keypoints show: the first one, and one beside it.
-        views = [m for m, near in zip(modes, same.tolist(), strict=True) if m.beside != mode.beside and not near]
-        views = [m for m in views if m.beside or m is modes[0]]
+        views = [m for m, near in zip(modes, same.tolist(), strict=True) if not near]
+        views = [m for m in views if (m is modes[0] if mode.beside else m.beside)]
         other_view = max((m.count_unshared(mode.matches) for m in views), default=None)
         same = (found.states.mode == found.mode) | same[found.states.mode]
         agreeing = int(inliers(query, self.landmarks, mode.by_descriptors, state).sum())

@@ -33,8 +33,8 @@ def fit_exposure(
             corrected = gain * seen + offset
             # Colours that are clipped in the image and out of range in the rendering agree, but do not constrain the exposure.
             white = (measured > 1 - NEARLY_CLIPPED) & (corrected >= 1)
-            black = (measured < NEARLY_CLIPPED) & (corrected <= 0)
-            weight = known * weigh(corrected - measured) * ~(white | black)
+            clipped = white | ((measured < NEARLY_CLIPPED) & (corrected <= 0))
+            weight = known * weigh(corrected - measured) * ~clipped
         difference = measured - seen
         total = weight.sum(1, keepdim=True) + precision[1]
         mean, shift = ((weight * part).sum(1, keepdim=True) for part in (seen, difference))

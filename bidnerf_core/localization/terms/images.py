@@ -96,8 +96,19 @@ class Images:
 
     def _of_thumbnail(self, small: Thumbnail, T: SE3) -> tuple[Tensor, Tensor, Tensor]:
         """Return the cost, its gradient and its Hessian of one image."""
-        rgb, known, points, depth = render_view(self.renderer, small, T)
-        seen, measured, sure = rgb.mT, small.rgb.flatten(1).mT, known[..., None]
+        camera, count = small.camera, len(T.translation)
+        local = small.T_last_camera.to(small.flat).rotate(normalize(small.flat, dim=-1))
+        origin = small.T_last_camera.translation.to(local)
+        directions = local @ T.rotation.to(local).mT
+        origins = (T.rotation.to(local) @ origin + T.translation.to(local))[:, None].expand_as(directions)
+        rgb, known, along = self.renderer(origins.reshape(-1, 3), directions.reshape(-1, 3))
+        rgb, known = (
+            smooth(part.reshape(count, camera.height, camera.width, -1).permute(0, 3, 1, 2)) for part in (rgb, known)
+        )
+        rgb, along = rgb / known.clamp(min=1e-3), along.view(count, -1)
+        # The visible points in the last camera's frame, and their depths in the thumbnail's camera.
+        points, depth = origin + along[..., None] * local, along / torch.linalg.vector_norm(small.flat, dim=-1)
+        seen, measured, sure = rgb.flatten(2).mT, small.rgb.flatten(1).mT, known.flatten(1)[..., None]
 
         def inlier(off: Tensor) -> Tensor:
             return inlier_weight(off.square().sum(-1, keepdim=True), self.COLOUR_SCALE)
@@ -118,7 +129,7 @@ class Images:
         # Where the camera clips, the colour does not depend on the pose.
         inside = (corrected - 0.5).abs() < 0.5
         weight = inside * (sure * near.square() * (2 / self.COLOUR_SCALE**2 / error.shape[1]))
-        slope = (slopes(rgb.unflatten(-1, small.rgb.shape[1:]), small.camera) + small.slopes) / 2
+        slope = (slopes(rgb, camera) + small.slopes) / 2
         # A point (X, Y, Z) is seen at x = X / Z, y = Y / Z, and moves there by (dX - x dZ, dY - y dZ) / Z.
         by_z = -(slope * small.flat[:, :2]).sum(-1, keepdim=True)
         rotation = small.T_last_camera.rotation.to(slope)
@@ -128,27 +139,6 @@ class Images:
         weighted = (weight.mT[..., None] * rows).flatten(1, 2)
         gradient = (weighted.mT @ error.mT.flatten(1)[..., None])[..., 0]
         return cost, gradient, weighted.mT @ rows.flatten(1, 2)
-
-
-def render_view(renderer: Renderer, small: Thumbnail, T: SE3) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Render a thumbnail's n pixels from the poses T_world_last (h).
-
-    Returns smoothed colours (h 3 n), the fraction of each pixel that the map renders (h n), the visible points in the last
-    camera's frame (h n 3) and their depths in the thumbnail's camera (h n), metres.
-    """
-    camera, count = small.camera, len(T.translation)
-    local = small.T_last_camera.to(small.flat).rotate(normalize(small.flat, dim=-1))
-    origin = small.T_last_camera.translation.to(local)
-    rotation, translation = T.rotation.to(local), T.translation.to(local)
-    directions = local @ rotation.mT
-    origins = (rotation @ origin + translation)[:, None].expand_as(directions)
-    rgb, known, along = renderer(origins.reshape(-1, 3), directions.reshape(-1, 3))
-    rgb, known = (
-        smooth(part.reshape(count, camera.height, camera.width, -1).permute(0, 3, 1, 2)) for part in (rgb, known)
-    )
-    rgb, along = rgb / known.clamp(min=1e-3), along.view(count, -1)
-    points = origin + along[..., None] * local
-    return rgb.flatten(2), known.flatten(1), points, along / torch.linalg.vector_norm(small.flat, dim=-1)
 
 
 def refine_on_small_images(problem: Problem, state: States, blur: float) -> States:

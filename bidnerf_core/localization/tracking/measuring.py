@@ -169,7 +169,7 @@ class Measurer:
             if proposed is None:
                 return None
             T = proposed[0].T
-        number, fit, seen = landmarks_near(query, known, T, radius), None, None
+        number, fit = landmarks_near(query, known, T, radius), None
         landmarks = known[number]
         for within in (max(tight, min(radius, RADII[0] * query.threshold)), tight)[radius == 0 :]:
             seen = Projected(query, landmarks, States.known(T, still), within)
@@ -178,10 +178,9 @@ class Measurer:
                 return None
             points = Points.of_landmarks(known, number[matches.landmark], query.keypoints.pixels[matches.keypoint])
             fit = Fit.of(points, camera, T, known.correlation_of(len(points)))
+            fit = replace(fit, keypoints=len(query.view), by_chance=len(seen.matches(tight, 4 * tight)))
             T = fit.states.T[0]
-        assert fit is not None
-        assert seen is not None
-        return replace(fit, keypoints=len(query.view), by_chance=len(seen.matches(tight, 4 * tight)))
+        return fit
 
     def _by_landmarks(
         self, landmarks: LandmarkMap, frame: Frame, state: TrackerState, fit: Fit, predicted: Motion
