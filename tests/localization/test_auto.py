@@ -210,6 +210,21 @@ def test_no_rays_are_rendered_for_an_image_that_disagrees_with_the_surface_every
     assert judge.call_count == 1
 
 
+def test_a_search_that_ended_early_is_worse_than_a_completed_one_whatever_its_loss(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    module, none = import_module("bidnerf_core.localization.by_surface"), torch.zeros(0, dtype=torch.float64)
+    ended = [
+        Mock(complete=complete, scores=none.new_full((1,), 30.0), path=SE3.identity()[None], losses=none)
+        for complete in (1, 0)
+    ]
+    completed = answer(outcome=Outcome.UNDETERMINED, loss=50.0)
+    monkeypatch.setattr(module, "by_images", Mock(side_effect=[(each, none.new_ones(3)) for each in ended]))
+    monkeypatch.setattr(module, "localization_by_rays", Mock(return_value=completed))
+    problem = baked.problem(baked.unseen()[0])
+    assert module.localize_by_images(problem, baked.toy(), replace(QUICK, rounds=2), 0, None) is completed
+
+
 def test_what_looks_the_same_from_two_sides_is_ambiguous() -> None:
     """A box that half a turn maps onto itself."""
     scene = baked.even_box()

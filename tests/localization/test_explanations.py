@@ -217,7 +217,7 @@ def test_a_map_whose_images_do_not_determine_a_camera_leaves_it_free() -> None:
     sharp, wide = (explanations(query(PINHOLE), each, 4.0, 0.02) for each in (known, vague))
     torch.testing.assert_close(
         wide.deviation[:, :4].square() - sharp.deviation[:, :4].square(),
-        (vague.calibration_scatter.square() - known.calibration_scatter.square()).expand(len(wide), 4),
+        (vague.calibration_scatter.square() - known.calibration_scatter.square()).expand(len(wide.cameras), 4),
     )
 
 
@@ -261,7 +261,7 @@ def test_each_mode_is_compared_under_every_explanation() -> None:
         torch.zeros(2, dtype=torch.long),
     )
     about = found.about(free)
-    assert about.row.tolist() == [*range(len(found))] * 2
-    assert about.mode.tolist() == [0] * len(found) + [1] * len(found)
+    assert about.row.tolist() == [*range(len(found.cameras))] * 2
+    assert about.mode.tolist() == [0] * len(found.cameras) + [1] * len(found.cameras)
     torch.testing.assert_close(about.nuisances, found.mean.repeat(2, 1))
-    assert torch.equal(about.T.matrix()[: len(found)], POSES[0].matrix().expand(len(found), 4, 4))
+    assert torch.equal(about.T.matrix()[: len(found.cameras)], POSES[0].matrix().expand(len(found.cameras), 4, 4))

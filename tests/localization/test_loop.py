@@ -374,6 +374,55 @@ def test_a_pose_found_by_other_means_is_confirmed_or_contradicted() -> None:
     assert wrong is None or not wrong.verdict.accepted
 
 
+def landmark_loop() -> Loop:
+    matching = matcher().for_query()
+    problem = rig(textured_map(), [colour_only(unseen())], None, matcher=matching)
+    return Loop(problem.views, matching, problem)
+
+
+def test_a_pose_that_is_expected_of_any_image_is_not_refined() -> None:
+    loop = landmark_loop()
+    proposal, nearest = proposal_at("landmarks", TRUTH, loop.landmarks), loop.nearest(STRONGEST)
+    assert loop.answer(proposal, nearest, 0.1) is None
+    assert require(loop.answer(proposal, nearest, -0.1)).verdict.accepted
+
+
+def test_a_refused_pose_that_is_found_again_is_not_judged_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    accept = import_module("bidnerf_core.localization.accept")
+    monkeypatch.setattr(accept, "model", lambda: LogisticModel({}, -10.0))
+    loop = landmark_loop()
+    refused = require(loop())
+    assert refused.verdict.outcome is Outcome.UNCERTAIN
+    assert loop.at(TRUTH.retract(torch.tensor([0.01, -0.01, 0.01, 0.005, 0.0, 0.005]).double())) is refused
+    assert loop.at(TRUTH.retract(torch.tensor([0.3, 0.2, 0.0, 0.0, 0.0, 0.8]).double())) is not refused
+
+
+class Empty(TexturedGround):
+    def query(self, positions: torch.Tensor, directions: torch.Tensor) -> FieldValues:
+        return FieldValues(torch.zeros_like(positions[..., 0]), torch.zeros_like(positions))
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_all_rays_are_rendered_only_where_few_do_not_show_two_places_alike(
+    alike: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A copy of the ground is outside of the field; an empty field shows both alike."""
+    module, counts = import_module("bidnerf_core.localization.loop"), list[int]()
+    fit = module.fit_with_rays
+
+    def counted(best: Any, terms: Any, rays: Any, *others: Any) -> Any:
+        counts.append(len(rays))
+        return fit(best, terms, rays, *others)
+
+    monkeypatch.setattr(module, "fit_with_rays", counted)
+    ground, T = replace(ground_landmarks(), cameras=()), COPY.to(dtype=torch.float32)
+    copy = replace(ground, positions=T.apply(ground.positions), directions=T.rotate(ground.directions))
+    field = Empty() if alike else TexturedGround()
+    found = solved(colour_only(unseen()), rays=512, matching=LandmarkMatcher(concatenate([ground, copy])), field=field)
+    assert set(counts) == ({256} if alike else {256, 512})
+    assert found.verdict.outcome is (Outcome.AMBIGUOUS if alike else Outcome.CONVERGED)
+
+
 def test_another_place_competes_with_the_places_that_look_like_it_not_like_the_first() -> None:
     """The first pose, in a room that shares little, is not the most probable one; that one is in either of two equal rooms."""
     seen, rooms, T = points(), twice(point_landmarks()), COPY @ COPY
