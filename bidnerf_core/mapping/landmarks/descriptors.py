@@ -84,11 +84,20 @@ def unambiguous_nearest(a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"]) -> tup
     """Return the rows of ``a`` whose nearest descriptor in ``b`` is far nearer than the second-nearest, and the rows of the nearest."""
     if len(b) < 2:
         return torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.long)
-    others = b.float()
-    blocks = [smallest(squared_distances(part, others), 2) for part in a.split(MATCHED_ROWS)]
-    distances, indices = map(torch.cat, zip(*blocks, strict=True))
-    rows = (distances[:, 0] < RATIO**2 * distances[:, 1]).nonzero()[:, 0]
-    return rows, indices[rows, 0]
+    # Products with the squares of ``b`` as one more channel order each row as distances do. A block is overwritten by the next, since
+    # allocating each anew takes longer than computing it.
+    x, y = a.float(), b.float()
+    products = torch.cat([-2 * x, torch.ones(len(x), 1)], dim=1)
+    others = torch.cat([y, y.square().sum(-1, keepdim=True)], dim=1)
+    block = torch.empty(min(MATCHED_ROWS, len(a)), len(b))
+    best, second, nearest = torch.empty(len(a)), torch.empty(len(a)), torch.empty(len(a), dtype=torch.long)
+    for rows in torch.arange(len(a)).split(MATCHED_ROWS):
+        values = torch.mm(products[rows], others.T, out=block[: len(rows)])
+        best[rows], nearest[rows] = values.min(1)
+        second[rows] = values.scatter_(1, nearest[rows, None], torch.inf).amin(1)
+    squares = x.square().sum(-1)
+    rows = (best + squares < RATIO**2 * (second + squares)).nonzero()[:, 0]
+    return rows, nearest[rows]
 
 
 def mutual_matches(a: UInt8[Tensor, "n d"], b: UInt8[Tensor, "m d"]) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
