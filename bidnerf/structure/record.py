@@ -175,7 +175,10 @@ def remove_output(folder: Path) -> None:
         shutil.rmtree(folder / FRAMES)
     (folder / RECORD).unlink(missing_ok=True)
     shutil.rmtree(folder / WORK, ignore_errors=True)
-    for part in filter(is_output, folder.glob(f"{PART}*")):
-        shutil.rmtree(part)
-    for name in ("cameras", "frames", "images", "points3D", "rigs"):
-        (folder / MODEL / f"{name}.bin").unlink(missing_ok=True)
+    for part in (folder, *filter(is_output, folder.glob(f"{PART}*"))):
+        (part / TRANSFORMS).unlink(missing_ok=True)
+        for name in ("cameras", "frames", "images", "points3D", "rigs"):
+            (part / MODEL / f"{name}.bin").unlink(missing_ok=True)
+        for emptied in (part / MODEL, (part / MODEL).parent, *([part] if part != folder else [])):
+            with contextlib.suppress(OSError):  # not empty, or not there
+                emptied.rmdir()

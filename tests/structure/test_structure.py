@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Callable
@@ -291,6 +292,19 @@ def test_photos_inside_the_folder_of_the_poses_are_never_removed(tmp_path: Path)
     photos.rename(tmp_path / "other" / "images")
     remove_output(tmp_path / "other")
     assert list((tmp_path / "other").iterdir()) == []
+
+
+def test_files_of_others_within_the_model_of_a_part_are_never_removed(search: Search, tmp_path: Path) -> None:
+    out = tmp_path / "poses"
+    shutil.copytree(search.out, out)
+    own = out / "part-2" / "sparse" / "0" / "notes.txt"
+    own.touch()
+    remove_output(out)
+    assert [path for path in out.rglob("*") if path.is_file()] == [own]
+    own.unlink()
+    (out / "part-2" / "transforms.json").touch()
+    remove_output(out)
+    assert not any(out.iterdir())
 
 
 def test_the_poses_are_beside_the_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -65,6 +65,8 @@ ENOUGH_IMAGES = 8
 Result = TypeVar("Result")
 PosedMatches: TypeAlias = dict[tuple[int, int], tuple[SE3, PairMatches]]
 """The matches of pairs of images, with the pose T_second_first of the cameras with which they were found."""
+Triangulated: TypeAlias = tuple[TrackedKeypoints, Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]
+"""The inlier keypoints, their points (metres, world), and the points' covariance for a noise of one pixel."""
 
 
 def update_scatter(updates: Sequence[Float[Tensor, "6"] | None]) -> Float[Tensor, "6 6"] | None:
@@ -155,6 +157,7 @@ class TrackedViews:
     # Positions (metres, world, float64) of the points by number, if they are known; otherwise they are triangulated.
     points: Float[Tensor, "p 3"] | None = None
     matches: PosedMatches = field(default_factory=dict)  # from which the tracks were joined, if they are known
+    _triangulated: dict[float, Triangulated] = field(default_factory=dict, init=False)  # by the minimum parallax
 
     def detector_of(self, view: View, number: int) -> Features:
         """Return a detector for queries with ``view``, which is image ``number``; the detector reuses the image's keypoints."""
@@ -164,7 +167,8 @@ class TrackedViews:
 
     def landmarks(self, config: LandmarkConfig, report: Callable[[str], None] = lambda sentence: None) -> LandmarkMap:
         """Return the landmarks built from the tracks. Raises ``InputError`` if there are none."""
-        landmarks = _build(self.observations, config, self.points)
+        inliers = self._inliers(config) if self.points is None else _triangulate(self.observations, config, self.points)
+        landmarks = _build(self.observations, config, *inliers)
         if not len(landmarks):
             images = len(self.observations.images)
             raise InputError(
@@ -182,13 +186,20 @@ class TrackedViews:
 
     def landmarks_by_image(self, config: LandmarkConfig) -> list[SeenLandmarks]:
         """Return the triangulated landmarks seen in each image; training uses their depth where none was measured."""
-        inliers, positions, covariance = _triangulate(self.observations, radians(config.parallax))
+        inliers, positions, covariance = self._inliers(config)
         return landmarks_by_image(inliers, positions, noise(inliers.sightings, positions) ** 2 * covariance)
 
     def triangulate(self, config: LandmarkConfig) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"]]:
         """Return the inlier keypoints of the triangulated points, and these points (metres, world)."""
-        inliers, positions, _ = _triangulate(self.observations, radians(config.parallax))
+        inliers, positions, _ = self._inliers(config)
         return inliers, positions
+
+    def _inliers(self, config: LandmarkConfig) -> Triangulated:
+        """Return what ``_triangulate`` does, which is done once; without the sightings, which take much memory."""
+        if config.parallax not in self._triangulated:
+            self._triangulated[config.parallax] = _triangulate(self.observations, config)
+        inliers, positions, covariance = self._triangulated[config.parallax]
+        return replace(inliers), positions, covariance
 
     @property
     def T_world_camera(self) -> SE3:
@@ -330,9 +341,14 @@ def detect_keypoints(views: Sequence[View], features: Features) -> list[ImageKey
     return [*map_tasks(image_keypoints, ((view, features) for view in views))]
 
 
-def _build(observations: TrackedKeypoints, config: LandmarkConfig, known: Float[Tensor, "p 3"] | None) -> LandmarkMap:
-    """Return the triangulated or ``known`` landmarks, followed by landmarks from the measured depth of the remaining keypoints."""
-    inliers, positions, covariance = _triangulate(observations, radians(config.parallax), known)
+def _build(
+    observations: TrackedKeypoints,
+    config: LandmarkConfig,
+    inliers: TrackedKeypoints,
+    positions: Float[Tensor, "n 3"],
+    covariance: Float[Tensor, "n 3 3"],
+) -> LandmarkMap:
+    """Return the landmarks of triangulated points, followed by landmarks from the measured depth of the remaining keypoints."""
     pixel_noise = noise(inliers.sightings, positions)
     triangulated = fuse_landmarks(inliers, positions, pixel_noise**2 * covariance, pixel_noise)
     # With 200 images, the deviations are known to 7 %.
@@ -357,12 +373,11 @@ def _is_tracked(observations: TrackedKeypoints) -> Bool[Tensor, "m"]:
 
 
 def _triangulate(
-    observations: TrackedKeypoints, least: float, known: Float[Tensor, "p 3"] | None = None
-) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
-    """Return the inlier keypoints, their points (metres, world), and the points' covariance for a noise of one pixel.
+    observations: TrackedKeypoints, config: LandmarkConfig, known: Float[Tensor, "p 3"] | None = None
+) -> Triangulated:
+    """Return the points that the tracked keypoints show, with at least the minimum parallax.
 
-    ``least`` is the minimum parallax (radians) of a point. If ``known`` positions are given, by number, they are used instead of
-    triangulated ones.
+    If ``known`` positions are given, by number, they are used instead of triangulated ones.
     """
     observations, former = observations[_is_tracked(observations)].compact()
     count = observations.count
@@ -378,7 +393,7 @@ def _triangulate(
         views = torch.bincount(point[fits], minlength=len(points))[point]
         fits &= (views != 2) | fits_points(observations.sightings, points, min(tolerance, 1.5))
         observations = observations[fits & (torch.bincount(point[fits], minlength=len(points)) >= 2)[point]]
-    wide = parallax(observations.sightings, points) >= least
+    wide = parallax(observations.sightings, points) >= radians(config.parallax)
     observations, numbers = observations[wide[observations.point]].compact()
     return observations, points[numbers], covariance[numbers]
 
