@@ -132,18 +132,6 @@ class MethodContract(Named):
             ),
         )
 
-    def test_missing_start_is_refused(self) -> None:
-        if not self._part(METHODS.load).needs_start:
-            return
-        localizer = Localizer(textured_map(surface=True), self.name, self.config, warm_up=False)
-        require(
-            self._who,
-            (
-                is_refused(lambda: localizer(unseen().frame)),
-                "needs a start, but does without one, expected an InputError",
-            ),
-        )
-
     def _first(self) -> Localization:
         """Return the answer for an image of the map's scene, found once per test class."""
         scene, view = textured_map(surface=True), unseen()

@@ -85,8 +85,8 @@ def open_binary(path: Path | PackedFile, expected: str) -> BinaryIO:
 
 
 def reason(error: Exception) -> str:
-    """Return the first line of an error's message, or the error's type if the message is empty."""
-    return str(error).strip().partition("\n")[0][:120] or type(error).__name__
+    """Return the first line of an error's message, without a number of the system's, or the error's type if the message is empty."""
+    return str(getattr(error, "strerror", None) or error).strip().partition("\n")[0][:120] or type(error).__name__
 
 
 def read_file(path: Path, expected: str, most: int = LARGEST_TEXT) -> bytes:

@@ -223,8 +223,11 @@ class Localizer:
     def solve(self, problem: Problem, seed: int = 0) -> Localization:
         """Solve a ``problem`` created by this localizer; the pose is in the map's own coordinates.
 
-        Raises ``InputError`` if the seed is unsuitable, or if the method does not return a ``Localization``.
+        Raises ``InputError`` if the seed is unsuitable, if the method needs a start and there is none, or if it does not return a
+        ``Localization``.
         """
+        if self._method.needs_start and problem.start is None:
+            raise InputError(f"method {self.method!r} needs a start; give one, or use a method that needs none")
         # On a CPU, operators are so short that sharing each of them among threads takes longer, and far longer on a busy machine.
         # Four threads suffice for the host of a GPU, which has little to compute.
         with threads_at_most(1 if problem.device.type == "cpu" else 4):

@@ -88,6 +88,7 @@ def first_depth(offset: float, name: str = "", rest: int = 1) -> Callable[[list[
     [
         ("groundtruth.txt", lambda rows: rows[2:10] + rows[18:], [0, 5, 6, 7, 8], []),  # a gap of 0.16 s
         ("groundtruth.txt", None, range(10), []),
+        ("groundtruth.txt", lambda rows: [], range(10), []),  # a header alone
         ("depth.txt", first_depth(0.0165), [], [0]),  # too late for its image
         ("depth.txt", None, [], range(10)),
         ("depth.txt", first_depth(-0.001, "depth/gone.png", 0), [], []),  # the next one takes its place

@@ -146,8 +146,9 @@ def test_a_video_that_breaks_off(clip: Path, tmp_path: Path) -> None:
 def test_files_that_are_no_video(content: bytes, tmp_path: Path) -> None:
     file = tmp_path / "clip.mp4"
     file.write_bytes(content)
-    with refused(where=file, found="not readable as a video", expected="a video file"):
+    with refused(where=file, found="not readable as a video", expected="a video file") as caught:
         open_sequence(file, focal=50)
+    assert "Errno" not in caught.error.found
 
 
 @pytest.mark.parametrize(

@@ -322,3 +322,5 @@ def test_a_method_that_returns_no_localization_is_named(monkeypatch: pytest.Monk
     monkeypatch.setattr("bidnerf_core.registry.registered", {("methods", "nothing"): nothing})
     with refused(found="method 'nothing' returned a NoneType", expected="a Localization"):
         Localizer(MAP, "nothing")(FRAME, START)
+    with refused(found="method 'nothing' needs a start"):
+        Localizer(MAP, "nothing")(FRAME)

@@ -35,13 +35,14 @@ from bidnerf_core.datasets.file_names import FileNames
 from bidnerf_core.datasets.reader import DatasetOptions, Format, first_file
 from bidnerf_core.datasets.trajectories import (
     LARGEST_GAP,
+    POSE,
     TimedRow,
     read_timed_files,
     read_trajectory,
 )
 from bidnerf_core.depth import DepthReader
 from bidnerf_core.errors import amount
-from bidnerf_core.io import is_file
+from bidnerf_core.io import is_file, read_rows
 
 SENSORS = {
     "1": Intrinsics(517.3, 516.5, 319.1, 255.8, 640, 480, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
@@ -59,7 +60,8 @@ def _read(path: Path, colour_list: Path, options: DatasetOptions) -> Capture:
     """
     names, colours, truth = FileNames(path), read_timed_files(colour_list), path / "groundtruth.txt"
     times = [row.time for row in colours]
-    trajectory = read_trajectory(truth, times) if truth.is_file() else None
+    has_poses = truth.is_file() and read_rows(truth, "a trajectory", POSE)  # a header alone is as good as no file
+    trajectory = read_trajectory(truth, times) if has_poses else None
     given: Camera | Path | None = options.given_camera
     if isinstance(given, Path) and not given.exists():
         given = _published_camera(str(given), whole=True) or given
