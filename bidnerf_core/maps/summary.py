@@ -88,7 +88,8 @@ class MapSummary:
     def __str__(self) -> str:
         info, facts, bounds = self.info, self.facts, self.info.bounds
         up, surface = facts["up"], facts["surface"]
-        photos = amount(len(info.cameras), "image") if info.cameras else "cameras not recorded"
+        kind = "rendered image" if info.landmark_source == "rendered images" else "image"
+        photos = amount(len(info.cameras), kind) if info.cameras else "cameras not recorded"
         added = f", {info.added} of which were added later" if info.added else ""
         stored = f"{facts['map']}, {(facts['bytes'] or 0) / 2**20:.1f} MiB" if facts["map"] else "in memory"
         training = "none; 'bidnerf train DATA --out MAP' trains a field and builds a surface"
