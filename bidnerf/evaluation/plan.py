@@ -256,7 +256,9 @@ class Plan(Setup, Settings):
         self.starts()  # checks the sizes
         if self.protocol == "none" and find_method(self.method).needs_start:
             others = " or ".join(name for name in PROTOCOLS if name != "none")
-            raise InputError(f"method {self.method!r} needs a start, which `protocol` none does not give", expected=others)
+            raise InputError(
+                f"method {self.method!r} needs a start, which `protocol` none does not give", expected=others
+            )
 
     def starts(self) -> tuple[Size, ...]:
         """Return the sizes of the starts: those given, or the protocol's."""

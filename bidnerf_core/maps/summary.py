@@ -88,8 +88,12 @@ class MapSummary:
     def __str__(self) -> str:
         info, facts, bounds = self.info, self.facts, self.info.bounds
         up, surface = facts["up"], facts["surface"]
-        kind = "rendered image" if info.landmark_source == "rendered images" else "image"
-        photos = amount(len(info.cameras), kind) if info.cameras else "cameras not recorded"
+        is_rendered = info.landmark_source == "rendered images" and not info.seconds  # of a field trained elsewhere
+        photos = (
+            amount(len(info.cameras), "rendered image" if is_rendered else "image")
+            if info.cameras
+            else "cameras not recorded"
+        )
         added = f", {info.added} of which were added later" if info.added else ""
         stored = f"{facts['map']}, {(facts['bytes'] or 0) / 2**20:.1f} MiB" if facts["map"] else "in memory"
         training = "none; 'bidnerf train DATA --out MAP' trains a field and builds a surface"
