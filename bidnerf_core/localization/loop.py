@@ -376,7 +376,7 @@ class Loop:
         inlier = (term.residuals(state)[0][0] <= OUTLIER**2) & (term.valid[found.mode] > 0)
         count, distance = int(inlier.sum()), term.distance(state)
         within = RADII[-1] * query.threshold
-        seen = Projected(query, self.landmarks, state, within)
+        seen = Projected(query, self.landmarks, state, within, mode.seen)
         chance = sum(len(seen.matches(within, shift * within)) for shift in (4, -4)) / 2
         pixels = query.keypoints.pixels[mode.matches.keypoint]
         occupied = cells(pixels, query.camera) + CELLS**2 * query.view[mode.matches.keypoint]

@@ -29,6 +29,7 @@ class Mode:
     matches: Matches
     mirrored: bool = False  # whether ``query`` is the mirror image
     beside: bool = False  # whether it explains keypoints that do not agree with the first place, as in a collage
+    seen: Projected | None = None  # the landmarks in view, once they are known
 
     def count_unshared(self, others: Matches) -> int:
         """Return the number of matched keypoints that are not matched in ``others``."""
@@ -90,14 +91,14 @@ class ModeSearch:
         modes, best = map(list, zip(first, *(other for other in others if other is not None), strict=True))
         if by_chance and len(modes) == 1:
             return [], none
-        seen: list[Projected | None] = [None] * len(modes)
         for radius in RADII:
             for g, mode in enumerate(modes):
                 within = radius * mode.query.threshold
-                seen[g] = projected = Projected(mode.query, self.matcher.landmarks, best[g], within, seen[g])
-                matches = projected.matches(within)
-                if len(matches) >= LEAST_AGREEING:
-                    modes[g] = mode = replace(mode, matches=matches)
+                seen = Projected(mode.query, self.matcher.landmarks, best[g], within, mode.seen)
+                matches = seen.matches(within)
+                if len(matches) < LEAST_AGREEING:
+                    matches = mode.matches
+                modes[g] = mode = replace(mode, seen=seen, matches=matches)
                 best[g] = self._fit(mode, best[g])
         # Matches by chance are no other view of the scene.
         first = modes[0].matches
