@@ -177,11 +177,12 @@ class Places:
     def shown(self, descriptors: UInt8[Tensor, "q d"]) -> Int[Tensor, "s"] | None:
         """Return the landmarks shown by the images that are similar to a query; None without such images, or if these show many.
 
-        Each of some ``descriptors`` votes for the first image that shows the landmark nearest to it. As another place that is as similar
-        must not be missed, an image is similar if it has three tenths of the votes of the best one.
+        Each of some ``descriptors`` votes for the first image that shows the landmark nearest to it in its own cell; more cells take longer
+        and give other places as many more votes. As another place that is as similar must not be missed, an image is similar if it has three
+        tenths of the votes of the best one.
         """
         voters = torch.linspace(0, len(descriptors) - 1, min(len(descriptors), VOTERS)).long()
-        votes = torch.bincount(self.image[self.index.nearest(descriptors[voters], 1, cells=4)[1][:, 0]])
+        votes = torch.bincount(self.image[self.index.nearest(descriptors[voters], 1, cells=1)[1][:, 0]])
         most = int(votes.max()) if len(votes) else 0
         if most < LEAST_VOTES:
             return None
