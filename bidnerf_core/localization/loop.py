@@ -55,7 +55,7 @@ from bidnerf_core.localization.propose import (
     proposal_at,
     proposals_at,
 )
-from bidnerf_core.localization.result import Localization, Outcome, Verdict, current_record
+from bidnerf_core.localization.result import Localization, Verdict, current_record
 from bidnerf_core.localization.terms.images import Images, refine_on_small_images
 from bidnerf_core.localization.terms.rays import OUTLIER, RenderedRays
 from bidnerf_core.localization.terms.surface import Surface
@@ -161,30 +161,22 @@ class Loop:
         places = {matcher.device} if problem is None else {matcher.device, problem.device}
         self.device = places.pop() if len(places) == 1 else torch.device("cpu")
         self._nearest: dict[int, Nearest] = {}
-        self._best: LandmarkAnswer | None = None
 
     @torch.no_grad()
     def __call__(self) -> LandmarkAnswer | None:
         """Return the best answer; None if no pose agrees with enough landmarks."""
+        best: LandmarkAnswer | None = None
         for proposal, nearest, nfa in self._proposals():
             answer = self.answer(proposal, nearest, nfa)
             if answer is not None and answer.verdict.accepted:
                 return answer
-            best = self._best
             if answer is not None and (best is None or answer.evidence.log10_nfa < best.evidence.log10_nfa):
-                self._best = answer
-        return self._best
+                best = answer
+        return best
 
     @torch.no_grad()
     def at(self, T_world_rig: SE3) -> LandmarkAnswer | None:
-        """Return the answer at a pose found by other means; None if too few landmarks match there.
-
-        It is the best answer of before if that has the same pose, which did not agree with landmarks by chance.
-        """
-        if (best := self._best) is not None and keeps_bound("log10_nfa", best.evidence.log10_nfa):
-            middle = torch.tensor([0.0, 0.0, best.distance], dtype=torch.float64)
-            if bool(same_pose(T_world_rig, best.T_world_rig[None], middle)):
-                return best
+        """Return the answer at a pose found by other means; None if too few landmarks match there."""
         proposal = proposal_at("elsewhere", T_world_rig, self.landmarks)
         return self.answer(proposal, self.nearest(STRONGEST), 0.0, searched=False)
 
@@ -201,7 +193,8 @@ class Loop:
             states, term = run_on(self.device, weigh, states, term_of(modes, states, self.landmarks, self.device))
             answer = self._fuse(modes, states, term, given, searched)
             # If another place is the most probable one, the places that look like it compete with it, not those that look like the first.
-            if answer.posterior.mode == 0 or answer.mode.mirrored or answer.verdict.outcome is Outcome.AMBIGUOUS:
+            is_only_place = keeps_bound("other_place", answer.evidence.other_place)
+            if answer.posterior.mode == 0 or answer.mode.mirrored or not is_only_place:
                 break
             chosen, first, nfa = answer.posterior.chosen, answer.mode.by_descriptors, answer.evidence.log10_nfa
             proposal = Proposal(answer.mode.name, chosen.T[0], chosen.nuisances[0, :6], answer.distance)

@@ -387,16 +387,6 @@ def test_a_pose_that_is_expected_of_any_image_is_not_refined() -> None:
     assert require(loop.answer(proposal, nearest, -0.1)).verdict.accepted
 
 
-def test_a_refused_pose_that_is_found_again_is_not_judged_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    accept = import_module("bidnerf_core.localization.accept")
-    monkeypatch.setattr(accept, "model", lambda: LogisticModel({}, -10.0))
-    loop = landmark_loop()
-    refused = require(loop())
-    assert refused.verdict.outcome is Outcome.UNCERTAIN
-    assert loop.at(TRUTH.retract(torch.tensor([0.01, -0.01, 0.01, 0.005, 0.0, 0.005]).double())) is refused
-    assert loop.at(TRUTH.retract(torch.tensor([0.3, 0.2, 0.0, 0.0, 0.0, 0.8]).double())) is not refused
-
-
 class Empty(TexturedGround):
     def query(self, positions: torch.Tensor, directions: torch.Tensor) -> FieldValues:
         return FieldValues(torch.zeros_like(positions[..., 0]), torch.zeros_like(positions))
