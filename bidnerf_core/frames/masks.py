@@ -117,7 +117,7 @@ class MaskFolder:
         """Raise ``InputError`` if none of the frames ``names`` has a mask."""
         if names and all(self.file_of(name) is None for name in names):
             raise InputError(
-                f"no mask in it matches any of {amount(len(names), 'image')} by name;",
+                "no mask in it matches an image by name;",
                 where=self.path,
                 expected=f"{names[0]}.png or the like, found {next(iter(self._by_name))}",
             )

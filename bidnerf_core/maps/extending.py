@@ -293,7 +293,7 @@ def _train_further(scene: Map, views: Sequence[View], steps: int | None, share: 
         views = [scaled_view(view, 1 / info.field_frame.scale) for view in views]
     grown = train_field(
         views,
-        Map(replace(info, step=0, complete=False, config=to_plain(settings, "config")), NoField()),
+        Map(replace(info, data=scene.name, step=0, complete=False, config=to_plain(settings, "config")), NoField()),
         TrainOptions(device=device_of(scene.field)),
         weights=field.state_dict(),
     )

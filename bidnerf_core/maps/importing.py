@@ -159,6 +159,7 @@ def import_map(
             log.info(
                 f"{where}: no photos; viewed from {amount(len(cameras), 'viewpoint')}"
                 f" {'around it' if found.is_solid else 'found in free space'}"
+                f"{'' if baking is None else '; rendering and baking take a minute or more on a CPU'}"
             )
         scene = replace(scene, info=replace(info, cameras=cameras))
         if views:

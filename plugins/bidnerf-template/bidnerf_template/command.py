@@ -7,7 +7,7 @@ from bidnerf.cli import Json, MapFolder, print_json, show
 
 def count_parameters(map: MapFolder, json: Json = False) -> None:
     """Count the parameters of a map's field."""
-    from bidnerf_core.maps import load_map  # here, so that --help does not wait for it
+    from bidnerf import load_map  # here, so that --help does not wait for it
 
     count = sum(parameter.numel() for parameter in load_map(map).field.parameters())
     if json:
