@@ -631,6 +631,7 @@ def test_the_demo_leaves_a_map_and_the_data_that_it_was_made_from(
     out = tmp_path / "out"
     made = bidnerf("demo", "--steps", 5, "--frames", 1, "--out", out)
     assert made.status == 0
+    assert re.search(r"the field renders the 1 others with a PSNR of \d+\.\d dB", made.out)
     (hint,) = [line for line in made.out.splitlines() if line.startswith("ask for a photo: bidnerf ")]
     assert bidnerf(*hint.split()[5:]).out.startswith("0000: ")
     data = open_dataset(out / "data")
