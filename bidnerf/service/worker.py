@@ -19,8 +19,6 @@ from io import BufferedRWPair
 from pathlib import Path
 from typing import Any, cast
 
-from pydantic import BaseModel
-
 from bidnerf.results import Answer
 from bidnerf.results import localize as localize_photos
 from bidnerf.service.models import MapFacts, Refused, Upload, validate
@@ -69,7 +67,11 @@ class LoadedMaps:
             if (protocol := task.get("protocol")) is None:
                 _, body = localize(task["upload"])
             else:
-                given = _validated(SERVICES[protocol].request, task["body"])
+                try:
+                    given = parse_json(task["body"], "", "a JSON object")
+                    validate(SERVICES[protocol].request, given)
+                except InputError as error:
+                    raise Refused(400, str(error)) from error
                 body = SERVICES[protocol].answer(given, self.scenes[task["map"]], localize)
             reply: dict[str, Any] = {"status": 200, "body": body}
         except Refused as error:
@@ -91,22 +93,11 @@ class LoadedMaps:
         photos, start = read_upload(upload, usual, folder, self.max_pixels)
         if several is not None and start is not None:
             raise InputError("start was given without map", expected=f"map as one of {', '.join(self.localizers)}")
-        if several is not None:
-            answers: Any = localize_photos(several, photos, seed=upload.seed)
-        else:
-            answers = localize_photos(localizer, photos, start=lambda _: start, seed=upload.seed)
+        answers: Any = localize_photos(
+            localizer if several is None else several, photos, start=lambda _: start, seed=upload.seed
+        )
         (answer,) = answers.answers
         return answer, {**answers.plain(answer), "frame": upload.name}
-
-
-def _validated(model: type[BaseModel], body: bytes) -> Any:
-    """Return the JSON of a request. Raises ``Refused`` if it is malformed or does not match the model."""
-    try:
-        given = parse_json(body, "", "a JSON object")
-        validate(model, given)
-    except InputError as error:
-        raise Refused(400, str(error)) from error
-    return given
 
 
 def main() -> None:

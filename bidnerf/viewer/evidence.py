@@ -48,11 +48,11 @@ def name_earlier(localization: Localization, answer: LandmarkAnswer) -> str:
 
 def probable_poses(answer: LandmarkAnswer) -> list[tuple[int, SE3, float]]:
     """Return the index, the most probable pose and the probability of each mode, in order of decreasing probability."""
-    posterior, poses = answer.posterior, list[tuple[int, SE3, float]]()
-    for mode in range(len(answer.modes)):
-        poses.append(
-            (mode, posterior.place(mode).to("cpu"), float(posterior.probability[posterior.states.mode == mode].sum()))
-        )
+    posterior = answer.posterior
+    poses = [
+        (mode, posterior.place(mode).to("cpu"), float(posterior.probability[posterior.states.mode == mode].sum()))
+        for mode in range(len(answer.modes))
+    ]
     return sorted(poses, key=lambda each: -each[2])
 
 

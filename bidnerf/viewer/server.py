@@ -41,8 +41,7 @@ def serve_view(
 
     token = choose_token(host, token)
 
-    def announce(address: str) -> None:
-        if ready is not None:
-            ready(address if token is None else f"{address}/?token={token}")
-
-    run_app(viewer_app(live, token, limits), host, port, announce, stop, grace=1)
+    query = "" if token is None else f"/?token={token}"
+    run_app(
+        viewer_app(live, token, limits), host, port, lambda address: ready and ready(address + query), stop, grace=1
+    )

@@ -289,13 +289,6 @@ def warp(frame: Frame, pixels: Float[Tensor, "h w 2"]) -> Frame:
     return replace(frame, rgb=rgb, alpha=alpha, depth=depth, hidden=hidden)
 
 
-def reflect(pixels: Float[Tensor, "*p 2"], width: int, height: int) -> Float[Tensor, "*p 2"]:
-    """Return pixels (u, v) mapped into an image: those beyond a border are reflected at it."""
-    size = pixels.new_tensor([width, height])
-    folded = pixels.remainder(2 * size)
-    return torch.minimum(folded, 2 * size - folded)
-
-
 def nearest(image: Float[Tensor, "h w"], pixels: Float[Tensor, "*p 2"]) -> Float[Tensor, "*p"]:
     """Return the values of the pixels that contain the positions ``pixels``, and 0 beyond the border."""
     height, width = image.shape
@@ -347,7 +340,10 @@ def move_piece(frame: Frame, share: float, generator: Generator) -> Frame:
     # The piece moves by a fraction of the image's shorter side, and comes slightly nearer.
     travel = uniform_number(generator, 0.15, 0.3) * min(height, width)
     move = torch.tensor(random_direction(generator)) * travel
-    elsewhere = warp(frame, reflect(frame.intrinsics.pixel_centres() - move, width, height))
+    # Pixels beyond a border of the image are reflected at it.
+    size = torch.tensor([width, height])
+    folded = (frame.intrinsics.pixel_centres() - move).remainder(2 * size)
+    elsewhere = warp(frame, torch.minimum(folded, 2 * size - folded))
     depth = None if elsewhere.depth is None else elsewhere.depth * uniform_number(generator, 0.85, 0.98)
     return _paste(frame, mask, elsewhere.rgb, depth, elsewhere.alpha)
 
