@@ -41,7 +41,7 @@ from _building import (
 )
 from _lab import RESULTS, Row, RowStore, Scene, answer, capture_of, one_thread, parser, record, within, without_depth
 
-from bidnerf import SE3, Localizer, Map, MapCollection, load_map
+from bidnerf import Localizer, Map, MapCollection, load_map
 from bidnerf.results import success_rate
 from bidnerf_core.captures import held_out_images, stored_cameras, tried_landmarks
 from bidnerf_core.fields import NoField, SceneBounds
@@ -182,14 +182,18 @@ def among_distractors(scene: str, folder: Path, size: int, copies: int, others: 
 
 
 def ask_scene(folder: Path, scene: str, frames: int) -> Row:
-    """Open the localizer of a map and localize test frames of a scene without depth."""
+    """Localize test frames of a scene, without depth, in the map of a folder."""
     one_thread()
-    views = [without_depth(view) for view in Scene.open(scene).views(count=frames)]
+    return ask(folder, [without_depth(view) for view in Scene.open(scene).views(count=frames)])
+
+
+def ask(folder: Path, views: Sequence[View]) -> Row:
+    """Open the localizer of a map and localize the frames of ``views``."""
     before, began = memory()[0], time.process_time()
     localizer = Localizer(load_map(folder), warm_up=False)
     opened = time.process_time() - began
     localizer(views[0].frame)
-    rows = [answer(lambda view=view: localizer(View(view.frame, SE3.identity()).frame), view) for view in views]
+    rows = [answer(lambda view=view: localizer(view.frame), view) for view in views]
     sizes = {"memory_MB": memory()[0] - before, "most_memory_MB": memory()[1] - before}
     return counts(rows) | {"opened_cpu_seconds": opened} | sizes
 
@@ -252,7 +256,8 @@ def build(count: int, keypoints: Path, folder: Path) -> Row:
     pairs, rows["pairs"] = measured(lambda: likely_pairs(photos.poses, config.neighbours))
     tracked, rows["matches and tracks"] = measured(lambda: track_views(views, StoredKeypoints(images)))
     tracked = replace(tracked, features=USUAL_FEATURES)
-    _, rows["landmarks"] = measured(lambda: tracked.landmarks(config))
+    # Of a copy, since tracks keep what they have triangulated
+    _, rows["landmarks"] = measured(lambda: replace(tracked).landmarks(config))
     landmarks, rows["trial"] = measured(lambda: tried_landmarks(tracked, photos, config))
     # Matching chooses the pairs again, and a trial builds the landmarks before.
     whole = rows["matches and tracks"]["cpu_seconds"] + rows["trial"]["cpu_seconds"]
@@ -285,16 +290,9 @@ def questions(rooms: int, count: int) -> list[tuple[int, View]]:
 
 
 def ask_building(folder: Path, rooms: int, queries: int) -> Row:
-    """Open the localizer of a building and localize new photos in it."""
+    """Localize new photos of a building in the map of a folder."""
     one_thread()
-    asked = questions(rooms, queries)
-    before, began = memory()[0], time.process_time()
-    localizer = Localizer(load_map(folder), warm_up=False)
-    opened = time.process_time() - began
-    localizer(asked[0][1].frame)
-    rows = [answer(lambda view=view: localizer(view.frame), view) for _, view in asked]
-    sizes = {"memory_MB": memory()[0] - before, "most_memory_MB": memory()[1] - before}
-    return counts(rows) | {"opened_cpu_seconds": opened} | sizes
+    return ask(folder, [view for _, view in questions(rooms, queries)])
 
 
 def exponent(rows: Sequence[Row], value: Callable[[Row], float]) -> float:
