@@ -209,7 +209,8 @@ def up_direction(poses: SE3, normals: Float[Tensor, "n 3"] | None = None) -> UpD
         (rotations[:, :, 0], rotations[:, :, 1], -3.0),
     ):
         for direction, support, source in [*planes, (_level(up_axis, level_axis), 0.0, "cameras")]:
-            direction = direction if float((up_axis @ direction).mean()) >= 0 else -direction
+            # Cameras that look along the vertical, as from a drone, look down.
+            direction = direction if float(((up_axis - rotations[:, :, 2]) @ direction).mean()) >= 0 else -direction
             looking_up = max(0.0, float((rotations[:, :, 2] @ direction).mean()))
             tilt = (level_axis @ direction).square().mean() / ROLL
             score = prior + math.log(CHANCE + support) - 0.5 * weight * float(tilt)

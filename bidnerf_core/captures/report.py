@@ -193,7 +193,8 @@ def sentences(report: CaptureReport, unit: LengthUnit = "units") -> list[str]:
         ),
         *((True, f"there are no photos {gap}: take some there, every 10 to 15°") for gap in covered.gaps),
         (
-            covered.open_side is not None,
+            # A capture of less than a quarter turn is one-sided on purpose.
+            covered.open_side is not None and covered.open_side.degrees < 270,
             f"there are no photos {covered.open_side}: take some there if you expect queries from that side",
         ),
         (

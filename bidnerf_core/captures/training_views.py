@@ -279,6 +279,7 @@ def adjust_poses(
         return None
     deviations, motion = _deviations(torch.stack(updates)), STILL
     for number in range(ROUNDS):
+        counter("refining poses", "rounds")(number, ROUNDS)
         fit = adjust_bundle(
             seen.sightings,
             Adjustment(tracked.T_world_camera, points, tracked.observations.motion),

@@ -65,6 +65,11 @@ def test_without_planes_level_cameras_tell() -> None:
     assert off_deg(up_direction(looking(ONE_WAY[:1], 10)).direction) < 12  # one photo: its own axis
 
 
+@pytest.mark.parametrize("down", [80, 95])
+def test_cameras_that_look_along_the_vertical_look_down(down: float) -> None:
+    assert off_deg(up_direction(looking(AROUND, down, 3)).direction) < 2
+
+
 def test_walls_do_not_count_as_floors() -> None:
     found = up_direction(looking(AROUND, 5, 3), normals(800, 6000, 4000))
     assert off_deg(found.direction) < 1
