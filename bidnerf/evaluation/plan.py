@@ -18,7 +18,7 @@ from pydantic_core import core_schema
 
 from bidnerf.evaluation.faults import NO_FAULT, check_depth, expand_faults
 from bidnerf.scenes import is_closed_form
-from bidnerf_core.datasets import TEST_IMAGES, Capture, DatasetOptions, describe_other_split
+from bidnerf_core.datasets import TEST_IMAGES, Capture, DatasetOptions
 from bidnerf_core.errors import InputError, InputWarning, amount, unknown_name
 from bidnerf_core.frames import INVERTED
 from bidnerf_core.geometry import SE3, perturb, random_units
@@ -299,10 +299,7 @@ def list_trials(plan: Plan, map: str, data: str, dataset: Capture) -> list[Trial
     split = plan.images.split
     protocol, names = find_protocol(plan.protocol), dataset.frame_names(split)
     check_depth(plan.faults, plan.depth)
-    for name in (name for name in plan.frames or () if name not in names):
-        others = {split: dataset.frame_names(split) for split in dataset.splits}
-        elsewhere = describe_other_split(name, others) or f"no frame {name!r}"
-        raise InputError(f"split {split!r}: {elsewhere}", where=data)
+    dataset.select(split, plan.frames)  # raises for an unknown name
     chosen = [name for name in names if plan.frames is None or name in plan.frames][: plan.first]
     hidden = [name for name in dataset.hidden_frames(split) if name in chosen]
     visible = [name for name in chosen if name not in hidden]

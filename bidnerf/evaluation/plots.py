@@ -36,7 +36,7 @@ from bidnerf.results import (
     line_style,
     new_figure,
     require_matplotlib,
-    save_figure,
+    write_figure,
 )
 from bidnerf_core.errors import amount
 
@@ -212,7 +212,9 @@ class Figures:
                 panel.set_axis_off()
             handles = [Line2D([], [], **look) for look in looks.values()]
             figure.legend(handles, labels, loc="outside lower left", ncols=beside)
-            return save_figure(figure, self.folder, name), caption
+            svg = self.folder / f"{name}.svg"
+            write_figure(figure, svg.with_suffix(".png"), svg, dpi=160)
+            return svg, caption
 
 
 def _set_logarithmic(axes: Any, name: str) -> None:

@@ -7,6 +7,7 @@ import io
 import math
 import os
 from collections.abc import Sequence
+from functools import cache
 from importlib.resources import files
 from itertools import groupby
 from operator import attrgetter
@@ -31,7 +32,7 @@ from bidnerf.evaluation.summary import (
 from bidnerf.evaluation.trial import TrialResult, open_data, trial_views
 from bidnerf.results import CRITERIA, CRITERION_NAMES, as_picture, common_unit, require_matplotlib
 from bidnerf.scenes import is_closed_form
-from bidnerf_core.datasets import Capture, DatasetOptions
+from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.geometry import symbol
 from bidnerf_core.io import is_temporary, output_folder, write_file
@@ -160,7 +161,7 @@ def worst_first(rows: Sequence[TrialResult]) -> list[TrialResult]:
 def add_images(rows: Sequence[TrialResult], data: Sequence[str | Path]) -> list[tuple[TrialResult, str | None]]:
     """Return each trial with its image (with faults) as a base64-encoded JPEG, or with None if its dataset is not in ``data``."""
     folders = {Path(os.path.realpath(folder)).name: str(folder) for folder in data}
-    datasets: dict[tuple[str, DatasetOptions], Capture] = {}
+    opened = cache(open_data)
     pairs: list[tuple[TrialResult, str | None]] = []
     for row in rows:
         trial = row.trial
@@ -170,10 +171,7 @@ def add_images(rows: Sequence[TrialResult], data: Sequence[str | Path]) -> list[
             continue
         # Results hold names of the files of masks, cameras and sensors, not their paths.
         own = {key: value for key, value in vars(trial.images).items() if key == "split" or not isinstance(value, str)}
-        key = name, DatasetOptions(**own)
-        if key not in datasets:
-            datasets[key] = open_data(*key)
-        view, content = trial_views(trial, datasets[key])[-1], io.BytesIO()
+        view, content = trial_views(trial, opened(name, DatasetOptions(**own)))[-1], io.BytesIO()
         image = Image.fromarray(as_picture(view.frame.rgb))
         image.thumbnail((240, 240))
         image.save(content, "JPEG", quality=80)

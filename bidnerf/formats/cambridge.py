@@ -12,7 +12,7 @@ Map-free: ``poses.txt`` has rows of a name, the quaternion (w x y z) and the tra
 
 from __future__ import annotations
 
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TypeAlias
 
 from bidnerf.formats.reality_capture import file_heads
@@ -26,6 +26,7 @@ from bidnerf_core.datasets import (
     camera_of,
     first_file,
     pose_of_numbers,
+    posix_name,
 )
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
@@ -49,7 +50,7 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
             images[name] = split, row, [*n[-3:], *n[:-3]] if map_free else n if lists else [*n[5:8], *n[1:5]]
     if not images:
         raise InputError("lists no images", where=file, expected="rows of a name and a pose")
-    lenses = {_stem(name): listed for name, listed in rows.items()}
+    lenses = {posix_name(name).with_suffix(""): listed for name, listed in rows.items()}
 
     def read(image: Path, name: str, entry: tuple[str, Row, list[float]]) -> Shot:
         split, row, (x, y, z, qw, *q) = entry
@@ -58,7 +59,7 @@ def _read(path: Path, file: Path, options: DatasetOptions) -> Capture:
             raise row.error(": is no pose")
         # Lists have the position beside the rotation to the camera, those of Map-free the translation.
         pose, camera = T.inverse() if map_free else SE3(T.rotation.mT, T.translation), options.camera_source
-        if (lens := lenses.get(_stem(name))) and not camera.is_given:
+        if (lens := lenses.get(posix_name(name).with_suffix(""))) and not camera.is_given:
             camera = CameraSource(_camera(*lens, image))
         return Shot(image=image, camera=camera, T_world_camera=pose, splits=(split,) if split else ())
 
@@ -87,10 +88,6 @@ def _rows(file: Path, count: int) -> dict[str, Listed]:
         name, *words = row.text.rsplit(maxsplit=count)
         found[name] = row, row.numbers(words, count)
     return found
-
-
-def _stem(name: str) -> str:
-    return str(PurePosixPath(name.replace("\\", "/")).with_suffix(""))
 
 
 def _camera(row: Row, numbers: list[float], image: Path) -> Intrinsics:

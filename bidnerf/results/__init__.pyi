@@ -33,7 +33,6 @@ from .plots import draw_capture as draw_capture
 from .plots import line_style as line_style
 from .plots import new_figure as new_figure
 from .plots import require_matplotlib as require_matplotlib
-from .plots import save_figure as save_figure
 from .plots import write_figure as write_figure
 from .pose_files import OPENCV_AXES as OPENCV_AXES
 from .pose_files import LandmarkMatches as LandmarkMatches

@@ -81,13 +81,6 @@ def new_figure(width: float, height: float) -> Any:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def save_figure(figure: Any, folder: Path, name: str) -> Path:
-    """Save a figure as SVG, and as PNG next to it; return the path of the SVG."""
-    folder.mkdir(parents=True, exist_ok=True)
-    write_figure(figure, folder / f"{name}.png", folder / f"{name}.svg", dpi=160)
-    return folder / f"{name}.svg"
-
-
 def write_figure(figure: Any, *paths: Path, dpi: int = 150) -> None:
     """Write a figure atomically to each path, in the format of its suffix.
 
@@ -95,13 +88,9 @@ def write_figure(figure: Any, *paths: Path, dpi: int = 150) -> None:
     truncated to a drawable length.
     """
     from matplotlib.text import Text
-    from matplotlib.ticker import FuncFormatter
 
     for text in figure.findobj(Text):
         text.set_text(_drawable(text.get_text()))
-    for formatter in (axis.get_major_formatter() for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
-        if isinstance(formatter, FuncFormatter):  # its labels are set again whenever a figure is drawn
-            formatter.func = lambda *given, labels=formatter.func: _drawable(str(labels(*given)))
     for path in paths:
         file, suffix = io.BytesIO(), path.suffix.lstrip(".") or "png"
         figure.savefig(file, format=suffix, dpi=dpi, metadata={"Date": None} if suffix == "svg" else {})

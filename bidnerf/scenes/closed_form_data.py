@@ -7,8 +7,7 @@ exact depth, as datasets for training maps and localizing in them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -18,31 +17,16 @@ from bidnerf.scenes.closed_form import look_around, orbit
 from bidnerf.scenes.demo import demo_object, demo_room
 from bidnerf.scenes.fields import GaussianBlobs
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.datasets import Capture, Shot
+from bidnerf_core.datasets import Capture, FrameShot
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields import SceneBounds, render_image
-from bidnerf_core.frames import BLACK, Frame
+from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
 from bidnerf_core.maps import Map, MapInfo
 
 PREFIX = "demo:"
 DEMO_CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
 FRAME_COUNT = 24
-
-Render = Callable[[SE3, str], Frame]
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class RenderedShot(Shot):
-    """A frame that is rendered from its pose."""
-
-    render: Render
-
-    def frame(self, background: tuple[float, float, float] = BLACK, side: int | None = None) -> Frame:
-        """Render this frame; ``background`` is ignored, since the scene has its own."""
-        assert self.T_world_camera is not None  # the pose of every frame is known
-        frame = self.render(self.T_world_camera, self.name)
-        return frame if side is None else frame.at_most(side)
 
 
 def is_closed_form(name: str) -> bool:
@@ -67,7 +51,7 @@ def closed_form_data(name: str) -> Capture:
             poses, training = look_around(scene.bounds, FRAME_COUNT, seed=1), look_around(scene.bounds, 40)
         render, background = partial(scene.render, DEMO_CAMERA), scene.bounds.background
     shots = [
-        RenderedShot(render=render, T_world_camera=pose, splits=(split,), stem=f"{number:04d}")
+        FrameShot(make=partial(render, pose), T_world_camera=pose, splits=(split,), stem=f"{number:04d}")
         for split, group in (("train", training), ("test", poses))
         for number, pose in enumerate(group)
     ]

@@ -51,16 +51,6 @@ C = SimpleNamespace(
 def demo_object() -> ClosedFormScene:
     """Return a toy lorry within the cube from -1 to 1, with its nose towards +x, in front of a white background."""
     bounds = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 12.0, (1.0, 1.0, 1.0))
-    return ClosedFormScene(_lorry(), bounds, "demo_object")
-
-
-def demo_room() -> ClosedFormScene:
-    """Return a living room of 4 x 3 x 2.5 m around the z axis with its floor at z = 0, to be seen from inside."""
-    bounds = SceneBounds((-2.05, -1.55, -0.05), (2.05, 1.55, 2.55), 0.05, 6.0)
-    return ClosedFormScene(_furniture(), bounds, "demo_room", light=(0.45, -0.3, 0.85), contrast=0.4)
-
-
-def _lorry() -> list[Primitive]:
     tyres = [
         ((0.58, -0.36), 0.25, C.sand),
         ((0.58, 0.36), 0.25, C.teal),
@@ -75,7 +65,7 @@ def _lorry() -> list[Primitive]:
             (cylinder(0.6 * radius, 0.03), 0.1, blotches(hub, C.red, 0.25, round(9 * x * y))),
         )
     ]
-    return [
+    solids = [
         _solid(box((0.9, 0.36, 0.09)), (0, 0, -0.36), stripes(C.navy, C.blue, (1, 0.6, 0), 0.3)),
         _solid(box((0.24, 0.38, 0.38)), (0.44, 0, 0.1), blotches(C.red, C.orange, 0.5, 1)),
         _solid(box((0.2, 0.39, 0.13)), (0.46, 0, 0.24), stripes(C.sky, C.white, (1, 0, 1), 0.32)),
@@ -97,10 +87,15 @@ def _lorry() -> list[Primitive]:
             yaw=80,
         ),
     ]
+    return ClosedFormScene(solids, bounds, "demo_object")
 
 
-def _furniture() -> list[Primitive]:
-    """Return the walls, a table, a sofa, a shelf with books (against the wall at -x), and decoration."""
+def demo_room() -> ClosedFormScene:
+    """Return a living room of 4 x 3 x 2.5 m around the z axis with its floor at z = 0, to be seen from inside.
+
+    Against its walls and on its floor are a table, a sofa, a shelf with books (at -x), and decoration.
+    """
+    bounds = SceneBounds((-2.05, -1.55, -0.05), (2.05, 1.55, 2.55), 0.05, 6.0)
     walls = Faces(
         (
             stripes(C.sky, C.cream, (0, 1, 0.25), 0.6),
@@ -138,7 +133,7 @@ def _furniture() -> list[Primitive]:
         )
         for i, (paint, tall) in enumerate(zip(paints, talls, strict=True))
     ]
-    return [
+    solids = [
         _solid(box((2.0, 1.5, 1.25)), (0, 0, 1.25), walls),
         _solid(cylinder(0.75, 0.012), (0.25, -0.1, 0.0), blotches(C.red, C.navy, 0.5, 13)),
         *legs,
@@ -174,6 +169,7 @@ def _furniture() -> list[Primitive]:
         _solid(cylinder(0.2, 0.16), (0.75, 1.25, 1.55), stripes(C.sand, C.cream, (1, 0, 1), 0.2)),
         _solid(ball(0.17), (0.2, 0.3, 2.2), checker(C.cream, C.orange, 0.24)),
     ]
+    return ClosedFormScene(solids, bounds, "demo_room", light=(0.45, -0.3, 0.85), contrast=0.4)
 
 
 def _solid(

@@ -155,15 +155,6 @@ def abbreviate(value: Any) -> str:
 # Responses. These models describe what is sent, but are not used to build it.
 
 
-class ErrorBody(BaseModel):
-    """An error (RFC 9457)."""
-
-    title: str
-    status: int
-    detail: str
-    localization: LocalizationBody = Field(ABSENT)
-
-
 class MapFacts(BaseModel):
     """Facts about a map."""
 
@@ -213,4 +204,10 @@ class LocalizationBody(BaseModel):
     runner_up: dict[str, Any] | None = Field(ABSENT, description="the second best of several maps")
 
 
-ErrorBody.model_rebuild()
+class ErrorBody(BaseModel):
+    """An error (RFC 9457)."""
+
+    title: str
+    status: int
+    detail: str
+    localization: LocalizationBody = Field(ABSENT)

@@ -233,10 +233,10 @@ def training_poses(
         for number, photo in relocate_photos(tracked, views, suspects(seen, link_photos(seen)), config).items()
         if photo.problem in ("badly posed", "turned")
     }
+    replaced = list(wrong)
     if wrong:
         updates = torch.zeros(len(views), 6, dtype=torch.float64)
-        for number, photo in wrong.items():
-            updates[number] = photo.update
+        updates[replaced] = torch.stack([photo.update for photo in wrong.values()])
         tracked = tracked.at(tracked.T_world_camera.retract(updates)).rematch(config, seen, points)
     fit = adjust_poses(tracked, config, least)
     pixels, refined = torch.zeros(len(views), dtype=torch.float64), False
@@ -244,13 +244,12 @@ def training_poses(
         (tracked, pixels, _), refined = fit, True
     elif fit is not None and wrong:
         poses, better = tracked.T_world_camera, fit[0].T_world_camera
-        for number in wrong:
-            poses.rotation[number] = better.rotation[number]
-            poses.translation[number] = better.translation[number]
+        poses.rotation[replaced] = better.rotation[replaced]
+        poses.translation[replaced] = better.translation[replaced]
         tracked = tracked.at(poses).rematch(config, *fit[0].triangulate(config))
     for number, photo in wrong.items():
         pixels[number] = photo.pixels
-    return TrainingPoses(tracked, pixels, list(wrong), refined, None if fit is None else fit[2])
+    return TrainingPoses(tracked, pixels, replaced, refined, None if fit is None else fit[2])
 
 
 def adjust_poses(

@@ -2,10 +2,10 @@ from .capture import HOLD_OUT_EVERY as HOLD_OUT_EVERY
 from .capture import BreaksOff as BreaksOff
 from .capture import Capture as Capture
 from .capture import DepthFile as DepthFile
+from .capture import FrameShot as FrameShot
 from .capture import Shot as Shot
 from .capture import TimedFrame as TimedFrame
 from .capture import capture_of as capture_of
-from .capture import describe_other_split as describe_other_split
 from .capture import hold_out as hold_out
 from .capture import unique_names as unique_names
 from .capture import warn_about as warn_about
@@ -17,6 +17,7 @@ from .colmap_files import stored_keypoints as stored_keypoints
 from .file_names import IMAGE_ENDINGS as IMAGE_ENDINGS
 from .file_names import FileNames as FileNames
 from .file_names import is_auxiliary as is_auxiliary
+from .file_names import posix_name as posix_name
 from .formats.colmap import colmap_models as colmap_models
 from .formats.colmap import colmap_project as colmap_project
 from .formats.colmap import shot_of as shot_of

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -327,7 +327,8 @@ class Capture:
         unknown = next((name for name in names if name not in by_name), None)
         if unknown is None:
             return [by_name[name] for name in names]
-        elsewhere = describe_other_split(unknown, {each: self.frame_names(each) for each in self.splits})
+        other = next((each for each in self.splits if unknown in self.frame_names(each)), None)
+        elsewhere = other and f"no frame {unknown!r}, which is in split {other!r}; choose that split"
         meant = [shot.name for shot in chosen if shot.stem == unknown]
         hint, expected = spelling_hint(unknown, by_name), f"one of {', '.join(meant[:4])}" if meant else None
         found = f"frame {unknown!r} is ambiguous" if meant else elsewhere
@@ -408,12 +409,6 @@ def unique_names(paths: Sequence[tuple[str, ...]], separator: str = "_") -> list
     return list(seen)
 
 
-def describe_other_split(name: str, splits: Mapping[str, Sequence[str]]) -> str | None:
-    """Return an error clause that names the split that contains frame ``name``, or None if no split contains it."""
-    found = next((split for split, names in splits.items() if name in names), None)
-    return found and f"no frame {name!r}, which is in split {found!r}; choose that split"
-
-
 def _name_shots(shots: Sequence[Shot], one_split: bool = False) -> list[Shot]:
     """Return the shots with unique names; a name includes the split only where needed to make it unique."""
     mixed = not one_split and len({shot.splits[:1] for shot in shots}) > 1
@@ -447,16 +442,24 @@ def hold_out(
 def capture_of(views: Sequence[View], path: Path, splits: tuple[str, ...] = SPLITS) -> Capture:
     """Return views in memory as a capture in which each of the ``splits`` contains all of the views."""
     return Capture(
-        path, [_ViewShot(view=v, stem=v.frame.name, T_world_camera=v.T_ref_camera, splits=splits) for v in views]
+        path,
+        [
+            FrameShot(make=v.frame.replace, stem=v.frame.name, T_world_camera=v.T_ref_camera, splits=splits)
+            for v in views
+        ],
     )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _ViewShot(Shot):
-    view: View
+class FrameShot(Shot):
+    """A shot whose frame is in memory or computed, such as a rendering; it has a background of its own."""
+
+    make: Callable[..., Frame]
+    """Returns the frame with the given ``name``."""
 
     def frame(self, background: Colour = BLACK, side: int | None = None) -> Frame:
-        found = self.view.frame.replace(name=self.name)
+        """Return the frame; the ``background`` is ignored."""
+        found = self.make(name=self.name)
         return found if side is None else found.at_most(side)
 
 

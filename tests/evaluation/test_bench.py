@@ -89,7 +89,7 @@ def test_a_plan_is_its_protocol_for_each_size() -> None:
             "none with this protocol; bid, bid-hard and perturb have sizes",
         ),
         ({"frames": []}, "nothing to try", "at least one frame"),
-        ({"frames": ["nope"]}, "split 'test': no frame 'nope'", None),
+        ({"frames": ["nope"]}, "no frame 'nope' among its 24 frames", "a name such as '0000'"),
         ({"images": DatasetOptions()}, "no split 'train'", "test"),
         ({"scene": "demo:object"}, "'demo:object'", "'bidnerf demo' trains maps"),
         ({"scene": "demo:blops"}, "'demo:blops'", "demo:blobs"),
