@@ -164,18 +164,18 @@ def add_images(rows: Sequence[TrialResult], data: Sequence[str | Path]) -> list[
     opened = cache(open_data)
     pairs: list[tuple[TrialResult, str | None]] = []
     for row in rows:
-        trial = row.trial
-        name = trial.data if is_closed_form(trial.data) else folders.get(trial.data)
-        if name is None:
-            pairs.append((row, None))
-            continue
-        # Results hold names of the files of masks, cameras and sensors, not their paths.
-        own = {key: value for key, value in vars(trial.images).items() if key == "split" or not isinstance(value, str)}
-        view, content = trial_views(trial, opened(name, DatasetOptions(**own)))[-1], io.BytesIO()
-        image = Image.fromarray(as_picture(view.frame.rgb))
-        image.thumbnail((240, 240))
-        image.save(content, "JPEG", quality=80)
-        pairs.append((row, base64.b64encode(content.getvalue()).decode()))
+        trial, encoded = row.trial, None
+        if name := trial.data if is_closed_form(trial.data) else folders.get(trial.data):
+            # Results hold names of the files of masks, cameras and sensors, not their paths.
+            own = {
+                key: value for key, value in vars(trial.images).items() if key == "split" or not isinstance(value, str)
+            }
+            view, content = trial_views(trial, opened(name, DatasetOptions(**own)))[-1], io.BytesIO()
+            image = Image.fromarray(as_picture(view.frame.rgb))
+            image.thumbnail((240, 240))
+            image.save(content, "JPEG", quality=80)
+            encoded = base64.b64encode(content.getvalue()).decode()
+        pairs.append((row, encoded))
     return pairs
 
 
