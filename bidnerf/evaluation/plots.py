@@ -213,6 +213,7 @@ class Figures:
             handles = [Line2D([], [], **look) for look in looks.values()]
             figure.legend(handles, labels, loc="outside lower left", ncols=beside)
             svg = self.folder / f"{name}.svg"
+            self.folder.mkdir(parents=True, exist_ok=True)
             write_figure(figure, svg.with_suffix(".png"), svg, dpi=160)
             return svg, caption
 

@@ -454,8 +454,7 @@ def capture_of(views: Sequence[View], path: Path, splits: tuple[str, ...] = SPLI
 class FrameShot(Shot):
     """A shot whose frame is in memory or computed, such as a rendering; it has a background of its own."""
 
-    make: Callable[..., Frame]
-    """Returns the frame with the given ``name``."""
+    make: Callable[..., Frame]  # returns the frame with the given ``name``
 
     def frame(self, background: Colour = BLACK, side: int | None = None) -> Frame:
         """Return the frame; the ``background`` is ignored."""
