@@ -119,7 +119,7 @@ FAULTS: dict[str, list[tuple[str, Edit, str | tuple[str, ...]]]] = {
     ],
     "tum": [
         ("groundtruth.txt", rows(lambda r: [r[0][:12], *r[1:]]), ("line 4", "2 of 8", "timestamp tx ty tz")),
-        ("groundtruth.txt", content(""), "no rows"),
+        ("groundtruth.txt", content(""), "the poses of the frames of a dataset"),
         ("groundtruth.txt", first_row("999.997", *"123000", "0.5"), ("line 4", "quaternion", "0.5")),
         ("groundtruth.txt", first_row("999.997", "a"), ("line 4", "'a'")),
         ("groundtruth.txt", rows(lambda r: [*r, f"{r[0].split()[0]} 0 0 0 0 0 0 1"]), "another pose at the time"),
