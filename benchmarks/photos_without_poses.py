@@ -1,8 +1,9 @@
 r"""Photos without poses: what finding their poses takes, beside COLMAP's incremental mapper, and on a cluster.
 
-    python benchmarks/photos_without_poses.py PHOTOS [PHOTOS ...] [--work photos_without_poses] [--parts ours,colmap,cluster,killed]
+    python benchmarks/photos_without_poses.py PHOTOS[:PARTS] [PHOTOS[:PARTS] ...] [--work photos_without_poses]
 
-PHOTOS are folders of photos, each of one scene. The parts, of which each is made once and kept in ``WORK/rows.jsonl``:
+PHOTOS are folders of photos, each of one scene. The parts (all of them unless PARTS names some, separated by commas), of which each is
+made once and kept in ``WORK/rows.jsonl``:
 
 - ``ours``: ``find_poses``, on one thread;
 - ``colmap``: the same keypoints; COLMAP's exhaustive matching and its incremental mapper with default options, on one thread. Its
@@ -10,7 +11,7 @@ PHOTOS are folders of photos, each of one scene. The parts, of which each is mad
 - ``cluster``: ``find_poses`` with the four processes of a local dask cluster;
 - ``killed``: the same, where one of the processes is killed at half of the pairs.
 
-CPU times are those of all processes. ``error`` is the mean reprojection error (pixels of the downscaled photos). ``apart`` is the median
+CPU times are those of all processes, which are started with the settings that docs/maps.md advises for a cluster. ``error`` is the mean reprojection error (pixels of the downscaled photos). ``apart`` is the median
 distance between the cameras of ours and of COLMAP's model after the best similarity, as a fraction of the extent of the cameras.
 """
 
@@ -18,7 +19,13 @@ from __future__ import annotations
 
 import os
 
-os.environ["OMP_NUM_THREADS"] = "1"  # also in the processes of the cluster
+os.environ |= {  # for the processes of the cluster
+    "OMP_NUM_THREADS": "1",
+    "MALLOC_MMAP_THRESHOLD_": f"{2**25}",
+    "MALLOC_TRIM_THRESHOLD_": f"{2**28}",
+    "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
+    "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "1s",
+}
 
 import resource
 import signal
@@ -174,9 +181,8 @@ def on_cluster(photos: Path, out: Path, kill: bool) -> Row:
 
 def main() -> None:
     given = parser(__doc__, "photos_without_poses")
-    given.add_argument("photos", nargs="+", type=Path, metavar="PHOTOS")
+    given.add_argument("photos", nargs="+", metavar="PHOTOS[:PARTS]")
     given.add_argument("--work", type=Path, default=Path("photos_without_poses"), help="folder for models and rows")
-    given.add_argument("--parts", default="ours,colmap,cluster,killed")
     options = given.parse_args()
     one_thread()
     pycolmap, results = import_pycolmap("photos"), dict[str, Any]()
@@ -187,10 +193,12 @@ def main() -> None:
         "killed": lambda photos, out: on_cluster(photos, out, kill=True),
     }
     with RowStore(options.work / "rows.jsonl") as store:
-        for photos in options.photos:
+        for scene in options.photos:
+            folder, _, wanted = scene.partition(":")
+            photos = Path(folder)
             name = photos.resolve().name if photos.name != "images" else photos.resolve().parent.name
             rows, base = dict[str, Row](), options.work / name
-            for part in options.parts.split(","):
+            for part in wanted.split(",") if wanted else parts:
                 rows[part] = store.get([name, part], partial(parts[part], photos, base / part))
                 rows[part]["cpu_seconds_a_photo"] = rows[part]["cpu_seconds"] / rows[part]["photos"]
                 print(name, part, rows[part], flush=True)
