@@ -9,7 +9,9 @@ made once and kept in ``WORK/rows.jsonl``:
 - ``colmap``: the same keypoints; COLMAP's exhaustive matching and its incremental mapper with default options, on one thread. Its
   database is kept, so that an interrupted run goes on;
 - ``cluster``: ``find_poses`` with the four processes of a local dask cluster;
-- ``killed``: the same, where one of the processes is killed at half of the pairs.
+- ``killed``: the same, where one of the processes is killed at half of the pairs;
+- ``posed``: what ``train`` does with the placed photos before the field: reading, detection, pairs, matches, tests of the poses, points,
+  landmarks and their trial.
 
 CPU times are those of all processes, which are started with the settings that docs/maps.md advises for a cluster. ``error`` is the mean reprojection error (pixels of the downscaled photos). ``apart`` is the median
 distance between the cameras of ours and of COLMAP's model after the best similarity, as a fraction of the extent of the cameras.
@@ -50,7 +52,11 @@ from bidnerf.structure import (
     write_cameras,
     write_keypoints,
 )
+from bidnerf_core.captures import prepare_views, tried_landmarks
+from bidnerf_core.carving import estimate_bounds
+from bidnerf_core.datasets import DatasetOptions
 from bidnerf_core.geometry import fit_similarity
+from bidnerf_core.maps import read_views
 from bidnerf_core.progress import Progress, job_context
 
 WORKERS = 4
@@ -179,6 +185,18 @@ def on_cluster(photos: Path, out: Path, kill: bool) -> Row:
     return timed(run) | {"killed": len(killed)}
 
 
+def prepared(dataset: Path, stages: Stages) -> Row:
+    """Return the row of what training does with a dataset before the field."""
+    with job_context(stages):
+        read = read_views(dataset, DatasetOptions(split="all"))
+        ready = prepare_views(read.views)
+        estimate_bounds(ready.views, read.background)
+        stages.end("trying the landmarks on images")
+        assert ready.tracked is not None
+        landmarks = tried_landmarks(ready.tracked, ready.views)
+    return {"photos": len(read.views), "pairs": len(ready.tracked.matches), "landmarks": len(landmarks)}
+
+
 def main() -> None:
     given = parser(__doc__, "photos_without_poses")
     given.add_argument("photos", nargs="+", metavar="PHOTOS[:PARTS]")
@@ -191,6 +209,7 @@ def main() -> None:
         "colmap": lambda photos, out: timed(lambda stages: colmap(photos, out, stages)),
         "cluster": lambda photos, out: on_cluster(photos, out, kill=False),
         "killed": lambda photos, out: on_cluster(photos, out, kill=True),
+        "posed": lambda _, out: timed(lambda stages: prepared(out.with_name("ours"), stages)),
     }
     with RowStore(options.work / "rows.jsonl") as store:
         for scene in options.photos:

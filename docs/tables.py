@@ -691,16 +691,44 @@ def large_photos(records: Records) -> str:
         "colmap": "COLMAP, all pairs, incremental mapper",
     }
     rows = []
-    for found in records["photos_without_poses"].values():
+    for scene, found in records["photos_without_poses"].items():
         for way, title in ways.items():
             if (own := found.get(way)) is not None:
                 placed = f"{own['placed']} of {own['photos']}"
                 rest = [f"{number}" for number in own["models"][1:]]
                 error, same = f"{own['error']:.3f} px", {True: "to the bit", False: "no"}.get(own.get("equal"), "")
-                rows.append((title, _seconds(own["cpu_seconds_a_photo"]), placed, ", ".join(rest), error, same))
+                rows.append((scene, title, _seconds(own["cpu_seconds_a_photo"]), placed, ", ".join(rest), error, same))
     return _table(
-        ("poses by", "CPU time a photo", "placed", "in other models", "error", "equal to one process"), rows, records
+        ("scene", "poses by", "CPU time a photo", "placed", "in other models", "error", "equal to one process"),
+        rows,
+        records,
     )
+
+
+@table
+def large_posed(records: Records) -> str:
+    """What ``train`` does with posed photos before it trains the field."""
+    rows = [
+        (
+            name,
+            own["photos"],
+            own["pairs"],
+            *(f"{own['cpu_seconds_of_stages'][stage] / own['photos']:.2f} s" for stage in PREPARATION),
+            f"{own['cpu_seconds_a_photo']:.2f} s",
+        )
+        for name, found in records["photos_without_poses"].items()
+        if (own := found.get("posed")) is not None
+    ]
+    return _table(("scene", "photos", "pairs", *PREPARATION.values(), "a photo, all"), rows, records)
+
+
+PREPARATION = {
+    "reading": "reading",
+    "landmarks": "keypoints and matches",
+    "checking poses": "poses and points",
+    "trying the landmarks on images": "landmarks and trial",
+}
+"""The stages before the field, by their names in reports of progress."""
 
 
 @table
