@@ -23,6 +23,7 @@ import os
 
 os.environ |= {  # for the processes of the cluster
     "OMP_NUM_THREADS": "1",
+    "OPENCV_FOR_THREADS_NUM": "1",
     "MALLOC_MMAP_THRESHOLD_": f"{2**25}",
     "MALLOC_TRIM_THRESHOLD_": f"{2**28}",
     "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
