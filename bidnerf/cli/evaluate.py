@@ -56,7 +56,7 @@ class TrialOptions:
             "SIZE...",
             "error of the start in units of the map, metres if it is metric: a length for bid and bid-hard (e_t in the"
             " BID-NeRF paper), LENGTH:DEGREES for perturb",
-            "the protocol's",
+            "the protocol's; of several, compare uses the first",
         ),
     ] = ()
     trials: Annotated[
@@ -85,7 +85,7 @@ class TrialOptions:
         try:
             numbers = [[float(number) for number in size.split(":")] for size in self.size]
         except ValueError as error:
-            raise UsageError(f"--size is {' '.join(self.size)}", expected="numbers such as 0.5, or 0.2:10") from error
+            raise UsageError(f"--size is {' '.join(self.size)!r}", expected="numbers such as 0.5, or 0.2:10") from error
 
         from bidnerf.evaluation import Plan
         from bidnerf_core.localization import find_method
@@ -153,7 +153,7 @@ def run_evaluate(
         raise UsageError("--workers and --dask contradict each other: a cluster has its own workers")
     if work.dask is not None:
         import_extra("distributed", "cluster", "a cluster")  # before the map is loaded
-    check_output(out, (), overwrite=True)  # finished trials are kept
+    check_output(out, (), overwrite=True, endings=(".jsonl",))  # finished trials are kept
     plan = starts.plan(
         method,
         images,
@@ -183,19 +183,10 @@ def run_compare(
     out: Annotated[
         Path | None, Option("DIR", "write compare.json, compare.png and compare.svg there", "not written")
     ] = None,
-    size: Annotated[
-        str | None,
-        Option(
-            "SIZE",
-            "error of the start in units of the map, metres if it is metric: a length for bid and bid-hard (e_t in the"
-            " BID-NeRF paper), LENGTH:DEGREES for perturb",
-            "the protocol's first",
-        ),
-    ] = None,
     *,
     starts: Annotated[
         Starts,
-        Without("size", "no_depth", "fault"),
+        Without("no_depth", "fault"),
         Group("trials", "Which frames are tried, and from which starts."),
     ],
     run: RunOptions,
@@ -218,7 +209,7 @@ def run_compare(
         require_map(map)
     if out is not None:
         check_folder(out, folders)
-    plan = replace(starts, size=() if size is None else (size,)).plan(method, images, device=run.device)
+    plan = starts.plan(method, images, device=run.device)
     require_device(run.device)
 
     from bidnerf.evaluation import compare, comparison_figure

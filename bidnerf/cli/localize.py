@@ -19,15 +19,15 @@ from bidnerf.cli.options import (
     RunOptions,
     Seed,
     StartFile,
+    existing,
     refuse,
     require_device,
     require_map,
     require_one,
-    require_some,
     wrong_usage,
 )
 from bidnerf.cli.output import check_folder, check_output, print_json, say, show
-from bidnerf.cli.parameters import Check, Group, Option
+from bidnerf.cli.parameters import Group, Option
 from bidnerf.cli.running import display_progress
 from bidnerf.cli.signals import defer_interruptions
 from bidnerf_core.errors import InputError, UsageError, amount, enumeration, errors_in
@@ -114,7 +114,7 @@ def run_localize(
             " image is localized in the one it shows",
             positional=True,
         ),
-        Check(require_some),
+        existing("photos or a dataset"),
     ],
     *,
     output: Annotated[AnswerOutput, Group("output", "Where answers are computed, and where they are written.")],
@@ -151,6 +151,7 @@ def run_localize(
     from bidnerf_core.localization import matches_landmarks, require_fit
     from bidnerf_core.maps import Localizer, MapCollection, landmark_cameras, load_map
 
+    config = method.config()
     start_of = start.of_queries()
     with wrong_usage():
         require_fit(
@@ -159,7 +160,6 @@ def run_localize(
             "needs a start; give one by --start, or use method",
         )
     require_device(output.device)
-    config = method.config()
     if output.draw is not None:
         check_folder(output.draw, inputs, create=True)
     if len(maps) > 1 or maps_in(map) not in ([], [map]):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -47,7 +48,7 @@ if TYPE_CHECKING:
 def run_info(
     map: MapFolder,
     json: Json = False,
-    plot: Annotated[Path | None, Option("PNG", "file for a picture of the capture from above", "no picture")] = None,
+    plot: Annotated[Path | None, Option("FILE", "draw the capture from above to this .png file")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Describe a map and the photos it was built from.
@@ -55,9 +56,7 @@ def run_info(
     The whole map is loaded, so that damage is detected.
     """
     if plot is not None:
-        if plot.suffix.lower() != ".png":
-            raise UsageError(where=plot, expected="the name of a PNG file")
-        check_output(plot, (), overwrite)
+        check_output(plot, (), overwrite, (".png",))
     from bidnerf.results import draw_capture, require_matplotlib
     from bidnerf_core.maps import load_map
 
@@ -102,7 +101,7 @@ def run_export(
 
     files = export_map(map, out, to, overwrite)
     sizes = {str(file): file.stat().st_size for file in files}
-    print_result(sizes, [f"{file}: {size / 1e6:.2f} MB" for file, size in sizes.items()], json)
+    print_result(sizes, [f"{file}: {size / 1e3:,.1f} kB" for file, size in sizes.items()], json)
 
 
 def run_scale(
@@ -141,10 +140,12 @@ def run_scale(
     first, second, length = distance or ("", "", "1")
     try:
         metres = float(length)
-    except ValueError as error:
-        raise UsageError(f"METRES is {length!r}", where="--distance", expected="a number") from error
+    except ValueError:
+        metres = math.nan
+    if not 0 < metres < math.inf:
+        raise UsageError(f"METRES is {length!r}", where="--distance", expected="a number, more than 0")
     if out is not None:
-        check_folder(out, (map,), may_be_map=overwrite)
+        check_folder(out, (map,), may_be_map=True)
 
     from bidnerf.results import read_positions
     from bidnerf_core.maps import factor_of_distance, factor_of_poses, load_map, map_folder
@@ -172,7 +173,10 @@ def run_render(
     frame: FrameNames = (),
     first: Annotated[First, EXPERT] = None,
     level: Annotated[
-        int | None, EXPERT, Option("N", "level of detail, 0 the coarsest", "the field itself, the finest")
+        int | None,
+        WholeNumbers(0),
+        EXPERT,
+        Option("N", "level of detail, 0 the coarsest", "the field itself, the finest"),
     ] = None,
     *,
     run: RunOptions,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,19 +28,17 @@ if TYPE_CHECKING:
 
 
 def existing(expected: str) -> Check:
-    """Return the check that a path exists, or is a scene in memory, such as demo:blobs; the error says what was ``expected``."""
+    """Return the check that a path exists, or is a scene in memory, such as demo:blobs; the error says what was ``expected``.
 
-    def check(path: Path | str) -> None:
-        if not str(path).startswith("demo:"):
-            require_existing(path, expected=expected)
+    Of several paths, one has to exist: a single one that is missing does not stop the others.
+    """
+
+    def check(given: Path | str | tuple[Path, ...]) -> None:
+        paths = given if isinstance(given, tuple) else (given,)
+        if not any(str(path).startswith("demo:") or os.path.exists(path) for path in paths):
+            require_existing(*paths, expected=expected)
 
     return Check(check)
-
-
-def require_some(paths: Sequence[Path]) -> None:
-    """Raise ``InputError`` if none of the paths exists; a single one that is missing does not stop the others."""
-    if not any(path.exists() for path in paths):
-        require_existing(*paths)
 
 
 def require_map(folder: Path | str) -> None:
@@ -244,7 +243,7 @@ class QueryOptions:
     depth: Annotated[
         tuple[Path, ...],
         Option("FILE...", "depth images or .npy files of the photos, in the same order, or matched by name"),
-        Check(require_some),
+        existing("a depth image"),
     ] = ()
     frame: FrameNames = ()
     first: Annotated[First, EXPERT] = None
@@ -273,11 +272,9 @@ class QueryOptions:
         """Return whether the QUERY arguments are a dataset, rather than photos."""
         from bidnerf_core.io import IMAGE_SUFFIXES
 
-        if self.frame:
-            return True
         others = [path for path in paths if path.suffix.lower() not in IMAGE_SUFFIXES]
-        if not others:  # which is known without the readers
-            return False
+        if self.frame or not others:  # which is known without the readers
+            return bool(others)
 
         from bidnerf_core.datasets import find_reader
 
@@ -295,17 +292,19 @@ class QueryOptions:
             if len(paths) > 1:
                 raise UsageError(f"{len(paths)} queries, one of which is a dataset", expected="the dataset alone")
             refuse(
-                {"--depth": self.depth, "--focal": self.camera.focal, "--hfov": self.camera.hfov},
-                f"is for photos, but {paths[0]} is a dataset, which has its own; to use its images as photos, name the files",
+                {"--depth": self.depth},
+                f"is for photos, but {paths[0]} is a dataset, which has its own; leave it out, or name its images as photos",
             )
+            camera = images.camera if self.camera == CameraOptions() else self.camera.source(images.camera)
 
             def frames(_: Sequence[Intrinsics], background: Background | None) -> DatasetFrames:
-                dataset = replace(images, background=background).open(paths[0])
+                dataset = replace(images, camera=camera, background=background).open(paths[0])
                 queries = DatasetFrames(dataset, self.split or TEST_IMAGES.split, self.frame, self.window, self.rig)
                 return queries.select(range(len(queries.names))[: self.first])
 
             return frames
-        refuse({"--split": self.split}, f"is for a dataset, but {paths[0]} is none; leave it out")
+        of_dataset = {"--split": self.split, "--frame": self.frame}
+        refuse(of_dataset, f"is for a dataset, but {paths[0]} is none; leave it out")
         if self.window > 1:
             raise UsageError(f"--window {self.window} needs known relative poses", expected="a dataset")
         if not self.depth:

@@ -69,16 +69,22 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], wide: str
 # Files and folders are checked before any work, and never replace an input.
 
 
-def check_output(out: Path, inputs: Iterable[Path | str | None], overwrite: bool) -> None:
+def check_output(
+    out: Path, inputs: Iterable[Path | str | None], overwrite: bool, endings: Sequence[str] = ("",)
+) -> None:
     """Raise an error, before any work is done, if the file ``out`` cannot be written or would replace an input.
 
     Inputs are the files of any map, the ``inputs``, and the files in folders among the ``inputs``. Raises
-    ``UsageError`` if ``out`` would replace an input, and ``InputError`` if ``out`` is a folder, if its folder does
-    not exist or is not writable, or if ``out`` exists and ``overwrite`` is not set.
+    ``UsageError`` if the name has none of the ``endings`` or if ``out`` would replace an input, and ``InputError`` if
+    ``out`` is a folder, if its folder does not exist or is not writable, or if ``out`` exists and ``overwrite`` is not
+    set.
     """
+    if not out.name.lower().endswith(tuple(endings)):
+        raise UsageError(where=out, expected=f"a name that ends with {' or '.join(endings)}")
     # os.path functions return False for a name that is too long, which is reported when it is written.
     if os.path.isdir(out) or not os.path.isdir(out.parent):
-        found = "is a folder" if os.path.isdir(out) else f"its folder {out.parent} does not exist"
+        state = "is a file" if os.path.exists(out.parent) else "does not exist"
+        found = "is a folder" if os.path.isdir(out) else f"its folder {out.parent} {state}"
         raise InputError(found, where=out, expected="a file in an existing folder")
     require_outside_maps(out.parent, out)
     _require_writable(out.parent, out)

@@ -82,6 +82,8 @@ def parse(command: str, target: Callable[..., T], arguments: Sequence[str]) -> T
         default = loaded[name] if name in loaded else pending[name].load(usual | given, words)
         return None if default is None else _build(type(default), given, [], default)
 
+    for name in loaded:  # a wrong setting is reported before any file is examined
+        settings(name)
     return _build(target, given | {name: functools.partial(settings, name) for name in pending}, [])
 
 

@@ -108,8 +108,8 @@ def _dispatch(given: list[str]) -> int:
         print(f"bidnerf {version('bidnerf')}")
         return DONE
     if given[0] not in COMMANDS:
-        unknown = f"no command {given[0]!r}{spelling_hint(given[0], COMMANDS)}"
-        return _report("bidnerf", unknown, WRONG_USAGE, f"\n{_usage()}")
+        hint = spelling_hint(given[0], [*COMMANDS, "--help", "--version"])
+        raise UsageError(f"no command {given[0]!r}{hint}; 'bidnerf --help' lists all commands")
     if any("\0" in word for word in given):
         raise UsageError("an argument holds a NUL character", expected="text")
     from bidnerf.cli.parser import parse  # imported here for the sake of a quick --version
@@ -182,11 +182,10 @@ class _Lines(logging.Handler):
         say(record.getMessage())
 
 
-def _report(name: str, message: str, status: int, more: str = "") -> int:
+def _report(name: str, message: str, status: int) -> int:
     """Print the reason for a failure, or a warning, on one line, and return ``status``, even if stderr is closed."""
     with contextlib.suppress(OSError):
-        print(f"{name}: {single_line(spelled(message, option_name))}", file=sys.stderr)
-        print(more, end=more and "\n", file=sys.stderr, flush=True)
+        print(f"{name}: {single_line(spelled(message, option_name))}", file=sys.stderr, flush=True)
     return status
 
 

@@ -27,7 +27,7 @@ from bidnerf.cli.parameters import Group, Option, SettingsGroup
 from bidnerf.cli.running import display_progress
 from bidnerf.cli.signals import defer_interruptions
 from bidnerf_core import maps
-from bidnerf_core.errors import InputError, UsageError, amount
+from bidnerf_core.errors import InputError, amount
 from bidnerf_core.installation import import_extra
 from bidnerf_core.registry import USUAL_METHOD
 from bidnerf_core.settings import EXPERT, WholeNumbers
@@ -81,7 +81,10 @@ def run_track(
         existing("a dataset, images or a video"),
     ],
     out: Annotated[Path, POSE_FILE, NEW_POSES],
-    plot: Annotated[Path | None, Option("PNG", "draw the path over the map's surface, coloured by uncertainty")] = None,
+    plot: Annotated[
+        Path | None,
+        Option("FILE", "draw the path over the map's surface, coloured by uncertainty, to this .png or .svg file"),
+    ] = None,
     *,
     run: RunOptions,
     frames: Annotated[FrameOptions, Group("frames", "Which frames are tracked, and whether their depth is used.")],
@@ -93,11 +96,11 @@ def run_track(
     Each pose is predicted from those before it, refined and validated. A frame whose pose is not accepted counts as lost; the
     following ones are searched for in the whole map. If the sequence has true poses, a table shows the errors.
     """
-    if plot is not None and plot.suffix.lower() not in (".png", ".svg"):
-        raise UsageError(where=plot, expected="a name that ends with .png or .svg")
     named = (sequence, images.camera, tracking.start, images.register_depth)
-    for file in filter(None, (out, plot)):
-        check_output(file, [Path(each) for each in named if isinstance(each, str | Path)], run.overwrite)
+    inputs = [Path(each) for each in named if isinstance(each, str | Path)]
+    check_output(out, inputs, run.overwrite)
+    if plot is not None:
+        check_output(plot, inputs, run.overwrite, (".png", ".svg"))
 
     from bidnerf.results import Answers, read_pose, require_matplotlib, track
     from bidnerf_core.datasets import is_video

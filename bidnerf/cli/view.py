@@ -19,10 +19,9 @@ from bidnerf.cli.options import (
     QueryImages,
     existing,
     require_device,
-    require_some,
 )
 from bidnerf.cli.output import check_output, console, say, show
-from bidnerf.cli.parameters import Check, Group, Option, Without
+from bidnerf.cli.parameters import Group, Option, Without
 from bidnerf.cli.running import display_progress
 from bidnerf.service import LEAST_TOKEN, ServiceLimits
 from bidnerf.service import serve as serve_maps
@@ -68,7 +67,7 @@ def run_view(
     query: Annotated[
         tuple[Path, ...],
         Option("[QUERY...]", "photos, folders of photos, or one dataset, to localize and show", positional=True),
-        Check(require_some),
+        existing("photos or a dataset"),
     ] = (),
     *,
     page: Annotated[PageOptions, Group("page", "What the page shows beside the map, and whether it is a file.")],
@@ -85,9 +84,8 @@ def run_view(
     if queries.frame and not query:
         raise UsageError("--frame names frames of a dataset", expected="the dataset as QUERY")
     if page.save is not None:
-        if page.save.suffix.lower() not in (".html", ".htm"):
-            raise UsageError("is no page", where=page.save, expected="a name that ends with .html")
-        check_output(page.save, (*query, *queries.depth, page.results, page.trajectory), page.overwrite)
+        inputs = (*query, *queries.depth, page.results, page.trajectory)
+        check_output(page.save, inputs, page.overwrite, (".html", ".htm"))
     else:
         viewer.require_viewer()
     opener = queries.opener(query, images) if query else None

@@ -31,7 +31,7 @@ from bidnerf.evaluation.trial import (
     run_trial,
 )
 from bidnerf.scenes import is_closed_form
-from bidnerf_core.errors import InputError, amount, printable
+from bidnerf_core.errors import InputError, UsageError, amount, printable
 from bidnerf_core.geometry import symbol
 from bidnerf_core.io import to_plain, write_file
 from bidnerf_core.maps import DESCRIPTION, Map, ViewSource, load_info, name_maps
@@ -146,7 +146,7 @@ def compare(
     sources = scenes if isinstance(scenes, Mapping) else name_maps(scenes)
     plan = plan or Plan()
     if len(plan.sizes or ()) > 1 or len(plan.faults) > 1:
-        raise InputError("maps are compared from one kind of start", expected="one size and one fault")
+        raise UsageError("maps are compared from one kind of start", expected="one size and one fault")
     with job_context(progress, cancel), ExitStack() as stack:
         for source in sources.values():
             if not isinstance(source, Map) and not is_closed_form(str(source)):

@@ -87,12 +87,14 @@ class Protocol:
 
     def check_size(self, size: Size) -> None:
         """Raise ``InputError`` for a size with the wrong number of values, or with a value out of range."""
-        most = [180.0 if "deg" in unit else 1e6 for unit in self.units]  # degrees, metres
+        most = [180.0 if unit == "DEGREES" else 1e6 for unit in self.units]
         if len(size) != len(self.units) or not all(0 <= x <= m for x, m in zip(size, most, strict=True)):
-            ranges = [f"{unit} from 0 to {largest:g}" for unit, largest in zip(self.units, most, strict=True)]
+            limits = ":".join("0" for _ in most), ":".join(f"{largest:g}" for largest in most)
             raise InputError(
                 f"size is {':'.join(f'{x:g}' for x in size) or 'missing'}",
-                expected=" : ".join(ranges) or "none with this protocol; bid, bid-hard and perturb have sizes",
+                expected=f"{':'.join(self.units)} from {limits[0]} to {limits[1]}"
+                if self.units
+                else "no size with this protocol; bid, bid-hard and perturb have sizes",
             )
 
 
@@ -101,13 +103,13 @@ PROTOCOLS = {
         "BID-NeRF: e_t in a random direction and a rotation from 0.2 rad (at 0.5) to pi/4 (at 3.4)",
         lambda T_true, size, seed: bid_start(T_true, size[0], seed),
         ((0.5,), (0.8,), (1.2,)),
-        ("e_t (m)",),
+        ("LENGTH",),
     ),
     "bid-hard": Protocol(
         "like bid, with rotations up to 1.4 rad",
         lambda T_true, size, seed: bid_start(T_true, size[0], seed, 1.4),
         ((0.5,), (0.8,), (1.2,)),
-        ("e_t (m)",),
+        ("LENGTH",),
     ),
     "inerf": Protocol(
         "iNeRF: up to 40 degrees about a random axis and up to 0.2 along each axis; five starts per frame",
@@ -119,7 +121,7 @@ PROTOCOLS = {
         "exactly the given errors, in random directions",
         lambda T_true, size, seed: perturb(T_true, size[0], size[1], seed),
         ((0.2, 10.0),),
-        ("metres", "degrees"),
+        ("LENGTH", "DEGREES"),
     ),
     "none": Protocol(
         "no start at all; one trial per frame",

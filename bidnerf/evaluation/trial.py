@@ -30,7 +30,7 @@ from bidnerf.scenes import closed_form_data, closed_form_map, is_closed_form
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import Capture, DatasetOptions, capture_of
 from bidnerf_core.devices import threads_at_most, working_device
-from bidnerf_core.errors import InputError, enumeration
+from bidnerf_core.errors import InputError, UsageError, enumeration
 from bidnerf_core.frames import View
 from bidnerf_core.geometry import LengthUnit
 from bidnerf_core.io import from_plain, to_plain
@@ -203,7 +203,7 @@ def open_data(data: ViewSource, options: DatasetOptions, stored: Map | None = No
         capture = capture_of(views, Path("views"))
     usual = replace(options, camera=None, register_depth=None, depth_unit=None, largest=None)
     if superfluous := [name for name, value in vars(options).items() if value != getattr(usual, name)]:
-        raise InputError(
+        raise UsageError(
             f"has its own cameras and depth; leave out {enumeration([f'`{name}`' for name in superfluous])}",
             where=capture.path,
         )

@@ -73,6 +73,8 @@ def export_map(scene: Map | str | Path, out: str | Path, to: str, overwrite: boo
         scene = (scene if isinstance(scene, Map) else load_map(scene)).whole()
         surface = None if scene.surface is None else scene.surface.to("cpu")
         landmarks = None if scene.landmarks is None else scene.landmarks.to("cpu")
+        if surface is None and landmarks is None:
+            log.info(f"{scene.name}: has neither a surface nor landmarks to export; 'bidnerf bake' makes both")
         return sorted(write(replace(scene, surface=surface, landmarks=landmarks), out))
 
 

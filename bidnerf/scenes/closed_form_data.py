@@ -18,7 +18,7 @@ from bidnerf.scenes.demo import demo_object, demo_room
 from bidnerf.scenes.fields import GaussianBlobs
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import Capture, FrameShot
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import UsageError
 from bidnerf_core.fields import SceneBounds, render_image
 from bidnerf_core.frames import Frame
 from bidnerf_core.geometry import SE3
@@ -37,7 +37,7 @@ def is_closed_form(name: str) -> bool:
 def closed_form_data(name: str) -> Capture:
     """Return the dataset ``demo:NAME``: split "test" and, if the scene has frames to train on, split "train".
 
-    Raises ``InputError`` for an unknown name.
+    Raises ``UsageError`` for an unknown name.
     """
     _check(name, ("blobs", "object", "room"), "data")
     training = list[SE3]()
@@ -59,7 +59,7 @@ def closed_form_data(name: str) -> Capture:
 
 
 def closed_form_map(name: str) -> Map:
-    """Return the map ``demo:NAME``. Raises ``InputError`` for a name whose field is not known in closed form."""
+    """Return the map ``demo:NAME``. Raises ``UsageError`` for a name whose field is not known in closed form."""
     _check(name, ("blobs",), "map")
     return Map(MapInfo("closed-form", {}, BLOBS, 0, True, "demo:blobs", weights="exact", unit="metres"), BLOB_FIELD)
 
@@ -67,7 +67,7 @@ def closed_form_map(name: str) -> Map:
 def _check(name: str, known: Sequence[str], what: str) -> None:
     if name.removeprefix(PREFIX) not in known:
         listed = " or ".join(PREFIX + one for one in known)
-        raise InputError(
+        raise UsageError(
             f"no closed-form {what} {name!r}", expected=f"{listed}; 'bidnerf demo' trains maps of the others"
         )
 

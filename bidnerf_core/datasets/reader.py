@@ -14,7 +14,7 @@ from bidnerf_core.datasets.capture import Capture, drop_missing_files, hold_out,
 from bidnerf_core.datasets.options import DatasetOptions as DatasetOptions
 from bidnerf_core.datasets.options import DepthRegistration
 from bidnerf_core.depth import DepthCamera as DepthCamera  # for authors of readers
-from bidnerf_core.errors import InputError, InputWarning, amount, enumeration
+from bidnerf_core.errors import InputError, InputWarning, UsageError, amount, enumeration
 from bidnerf_core.frames import MaskFolder, photos_in
 from bidnerf_core.io import IMAGE_SUFFIXES, is_file, looks_like_image, require_existing
 from bidnerf_core.io import Background as Background  # for authors of readers
@@ -84,7 +84,7 @@ def read_capture(
     ]
     for option, is_given, problem in given:
         if is_given and option not in reader.accepts:
-            raise InputError(problem, where=path)
+            raise UsageError(problem, where=path)
     try:
         capture: Any = reader.read(path, options)
     except Exception as error:
@@ -319,10 +319,9 @@ def no_dataset(path: Path, readers: Sequence[Reader] | None = None, or_else: str
                 "is a video in a container that is not read", where=path, expected="MP4: convert it first"
             )
         if looks_like_image(path):
+            several = "a folder of photos of the scene from several places, a video, or "
             return InputError(
-                "is a single photo" if or_else else "is a single photo, of which no map can be made",
-                where=path,
-                expected="a folder of photos of the scene from several places, a video, or the folder of a dataset",
+                "is a single photo", where=path, expected=f"{several if or_else else ''}the folder of a dataset"
             )
         is_archive = path.suffix.lower() in (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar")
         return InputError(

@@ -19,7 +19,7 @@ from bidnerf_core.datasets.reader import find_reader
 from bidnerf_core.datasets.video import is_video
 from bidnerf_core.errors import InputError, InputWarning, amount, enumeration
 from bidnerf_core.frames import natural_order, photos_in
-from bidnerf_core.io import find_header, open_binary
+from bidnerf_core.io import find_header, looks_like_image, open_binary
 from bidnerf_core.registry import Plugins, interface_defects
 
 POSE_NAMES = re.compile(
@@ -73,11 +73,13 @@ POSERS: Plugins[Poser] = Plugins("posers", lambda poser: interface_defects(poser
 
 
 def lacks_poses(path: str | Path, options: DatasetOptions = AS_STORED) -> bool:
-    """Return whether a path is a video, a folder of photos that no reader recognizes, or a recording without any pose."""
+    """Return whether a path is a photo, a video, a folder of photos that no reader recognizes, or a recording without any pose."""
     below = Path(path)
     if find_reader(below) is not None:
         return unposed_recording(below, options) is not None
-    return (bool(photos_in(below)[0]) or any(_subfolders(below, None))) if below.is_dir() else is_video(below)
+    if below.is_dir():
+        return bool(photos_in(below)[0]) or any(_subfolders(below, None))
+    return is_video(below) or looks_like_image(below)
 
 
 def unposed_recording(path: Path, options: DatasetOptions = AS_STORED) -> Capture | None:

@@ -223,7 +223,7 @@ class Map:
         if level is not None:
             offered = levels(field)
             if not 0 <= level < len(offered):
-                raise InputError(f"no level {level}", where=self.name, expected=f"0 to {len(offered) - 1}")
+                raise InputError(f"`level` is {level}", where=self.name, expected=f"0 to {len(offered) - 1}")
             field = offered[level]
         T = view.T_ref_camera.translated(-origin_of(self))
         return render_image(field, view.frame.intrinsics, T, self.bounds, motion=view.motion)

@@ -52,7 +52,7 @@ from bidnerf_core.maps.description_file import DESCRIPTION
 from bidnerf_core.progress import Progress, current_job, log
 from bidnerf_core.training import TrainingState, TrainingStep
 
-NEEDED = "a safetensors file, without which the map is incomplete"
+NEEDED = "a safetensors file, without which the map is incomplete; copy its folder again"
 BAKED = "a safetensors file, which 'bidnerf bake' can recreate"
 _NAMES = r"((weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors|capture-\d{8,}-[0-9a-f]{8}\.json)"
 OURS = re.compile(rf"{_NAMES}|\.({_NAMES}|map\.json)\.[0-9a-f]{{8}}")

@@ -140,7 +140,7 @@ def test_help_names_what_is_installed(bidnerf: Run) -> None:
     assert f"settings to begin with; {presets} (" in " ".join(bidnerf("localize", "--help-all").out.split())
 
 
-WRITTEN = {"--out", "--data", "--size"}
+WRITTEN = {"--out", "--data"}
 """Options whose placeholder says what the command writes, or how many it reads."""
 WITHOUT = {
     "--json": {"completion", "demo", "report", "serve", "view"},  # whose result is a page, a service or pictures

@@ -86,7 +86,7 @@ def test_a_plan_is_its_protocol_for_each_size() -> None:
         (
             {"protocol": "inerf", "sizes": [0.5]},
             "size is 0.5",
-            "none with this protocol; bid, bid-hard and perturb have sizes",
+            "no size with this protocol; bid, bid-hard and perturb have sizes",
         ),
         ({"frames": []}, "nothing to try", "at least one frame"),
         ({"frames": ["nope"]}, "no frame 'nope' among its 24 frames", "a name such as '0000'"),

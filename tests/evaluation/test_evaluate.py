@@ -308,7 +308,7 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
         ({"scene": BLOBS, "workers": 0}, "workers is 0", "1 or more"),
         ({"scene": BLOBS, "workers": -1}, "workers is -1", "1 or more"),
         ({"seed": -1}, "seed is -1", "a whole number, 0 to 2,147,483,647"),
-        ({"sizes": [(0.3, 1.0)]}, "size is 0.3:1", "e_t (m)"),
+        ({"sizes": [(0.3, 1.0)]}, "size is 0.3:1", "LENGTH from 0 to 1e+06"),
         ({"config": {"ray": 3}}, "'ray', did you mean 'rays'?", None),
         ({"faults": ["blurr:1"]}, "no fault 'blurr'", None),
         ({"faults": "blur:1"}, "faults is 'blur:1'", "a list, such as ['blur:1']"),
@@ -418,7 +418,7 @@ def test_a_trial_that_cannot_be_is_refused(trial: Trial) -> None:
     without: dict[str, Any] = {"protocol": "none", "size": ()}
     wrong: list[tuple[dict[str, Any], str | None, str, str | None]] = [
         ({"protocol": "bit"}, None, "no protocol 'bit', did you mean 'bid'?", None),
-        ({"size": ()}, None, "size is missing", "e_t (m)"),
+        ({"size": ()}, None, "size is missing", "LENGTH from 0 to 1e+06"),
         ({"config": '{"ray": 1}'}, "config", "'ray', did you mean 'rays'?", None),
         ({"config": "{"}, "config", "not JSON", "settings of bid"),
         (without, None, "method 'bid' needs a start", None),

@@ -275,7 +275,7 @@ def test_a_rendering_is_scored_against_the_photo(scene: bn.Map) -> None:
     perfect = rendering_scores(type(image)(view.frame.rgb, depth, image.opacity), view.frame)
     assert perfect.depth_error == 0
     assert not torch.equal(scene.render(view, level=0).rgb, image.rgb)
-    with refused(where="map in memory", found="no level 2", expected="0 to 1"):
+    with refused(where="map in memory", found="`level` is 2", expected="0 to 1"):
         scene.render(view, level=2)
     with refused(where="map in memory", found="view is a Frame", expected="a View"):
         scene.render(view.frame)  # type: ignore[arg-type]

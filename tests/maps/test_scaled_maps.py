@@ -240,5 +240,7 @@ def test_the_command(bidnerf: Run, tmp_path: Path) -> None:
     view = before.info.cameras[0]
     assert view.pose.translation.tolist() == pytest.approx(back.info.cameras[0].pose.translation.tolist())
     assert bidnerf("scale", tmp_path / "half")[0] == 2
-    assert_refused(bidnerf("scale", trained, "--factor", 2, "--out", tmp_path / "half"), 2, "exists already")
+    assert_refused(
+        bidnerf("scale", trained, "--factor", 2, "--out", tmp_path / "half"), 1, "exists already", "--overwrite"
+    )
     assert bidnerf("scale", tmp_path / "half", "--factor", "-1")[0] == 2

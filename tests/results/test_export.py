@@ -142,7 +142,10 @@ def test_landmarks_without_tracks_are_points_alone(scene: Map, tmp_path: Path) -
     assert (len(model.points3D), model.compute_num_observations()) == (len(landmarks), 0)
 
 
-def test_what_cannot_be_exported_is_said(scene: Map, tmp_path: Path) -> None:
+def test_what_cannot_be_exported_is_said(scene: Map, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO", "bidnerf"):
+        bn.export_map(replace(scene, surface=None, landmarks=None), tmp_path / "cameras", "ply")
+    assert "ground: has neither a surface nor landmarks to export; 'bidnerf bake' makes both" in caplog.text
     bare = replace(scene, info=replace(scene.info, cameras=()), surface=None, landmarks=None)
     with refused(where="ground", found="no cameras, but colmap needs some"):
         bn.export_map(bare, tmp_path / "out", "colmap")
