@@ -248,6 +248,7 @@ def run_report(
         Path | None,
         EXPERT,
         Option("PAGE.html", "page of 'bidnerf view --results', whose frames the report links to", ""),
+        existing("a page written by 'bidnerf view MAP --results ... --save'"),
     ] = None,
     data: Annotated[
         Names, Option("DATA...", "datasets of the results, from which the worst frames are shown", "no pictures")
@@ -257,8 +258,6 @@ def run_report(
 
     The page works offline. Trials are compared by map, data, start, method and settings. A trial in several files counts once.
     """
-    if view is not None and not view.is_file():
-        raise InputError("no such page", where=view, expected="one written by 'bidnerf view MAP --results ... --save'")
     if missing := [folder for folder in data if not Path(folder).is_dir()]:
         raise InputError("no such folder", where=missing[0], expected="a dataset that the results are of")
     check_folder(out, (*results, *data))

@@ -69,7 +69,6 @@ def test_every_path_is_checked_before_anything_is_loaded() -> None:
     }
     assert {each for each in unchecked if each[1] not in OUTPUTS} == {
         ("localize", "--map"),  # the command finds out where the maps end and the queries begin
-        ("report", "--view"),
         ("serve", "--token-file"),
     }
 
