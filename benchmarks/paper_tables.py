@@ -374,7 +374,8 @@ def main() -> None:
     for part in given.part:
         for folder in given.map or [None]:
             scene = scene_of(given.data, folder)
-            base = Plan(method="bid", seed=given.seed, device=given.device, frames=test_frames(*scene, tuning=False))
+            frames = test_frames(*scene, tuning=False)
+            base = Plan(protocol="bid", method="bid", seed=given.seed, device=given.device, frames=frames)
             trials = [trial for cell in PARTS[part](base, common, given.trials, scene) for trial in cell]
             name = f"{part}_{trials[0].portable.map.replace(':', '_') if folder else given.data}"
             groups = run_part(trials, given.out / f"{name}.jsonl", given.workers, given.stop_after)

@@ -37,7 +37,7 @@ CELLS = {
 
 @pytest.mark.parametrize("part", CELLS)
 def test_the_cells_of_a_part_are_tried_from_the_same_starts(part: str, script: Script, tmp_path: Path) -> None:
-    base, settings, data = Plan(method="bid", seed=0), {"rays": 8, "max_steps": 2}, BLOBS
+    base, settings, data = Plan(protocol="bid", method="bid", seed=0), {"rays": 8, "max_steps": 2}, BLOBS
     if part == "table2":
         around = views(demo_object(), Intrinsics(8.0, 8.0, 4.0, 4.0, 8, 8), CIRCLE)
         write_transforms(tmp_path, {"test": around})
