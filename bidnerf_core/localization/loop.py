@@ -66,7 +66,6 @@ from bidnerf_core.mapping import (
     LandmarkMap,
     Landmarks,
     States,
-    descend,
     true_intrinsics,
 )
 
@@ -229,7 +228,7 @@ class Loop:
     ) -> LandmarkAnswer:
         """Fuse all measurements under all explanations, and judge the result; rays are rendered only where they can change it."""
         terms, fused, others = list[CostTerm]([landmarks]), list[str](), dict[str, float | None]()
-        fit = self._settle_landmarks(best, landmarks, given)
+        fit = self._settle(fit_landmarks, best, torch.arange(len(best)), landmarks, given)
         found = self._posterior(fit, landmarks, given)
         points = self._points(found.chosen)
         if points is not None:
@@ -270,22 +269,6 @@ class Loop:
         if trial.difference > 0:
             others["difference"] = float(difference[found.mode])
         return self._judge(found, modes, landmarks, given, searched, others, (*fused, "rendering"))
-
-    def _settle_landmarks(self, best: States, landmarks: Landmarks, given: Explanations) -> ModeFits:
-        """Return the fit of the landmarks with most evidence, of those about the best state of each mode and about the stated camera.
-
-        In front of a wall, cameras differ by poses far apart, so that a model about one says little of another.
-        """
-        every = torch.arange(len(best))
-        fit = self._settle(fit_landmarks, best, every, landmarks, given)
-        if bool((fit.about.row == 0).all()):
-            return fit
-        stated, _ = run_on(self.device, descend, fit.states[fit.states.row == 0], [landmarks], 4)
-        other = self._settle(fit_landmarks, stated, every, landmarks, given)
-        better = (other.by_mode.amax(-1) > fit.by_mode.amax(-1)).nonzero()[:, 0]
-        if not len(better):
-            return fit
-        return run_on(self.device, fit_landmarks, fit.about.with_rows(better, other.about[better]), landmarks, given)
 
     def _points(self, state: States) -> Surface | None:
         """Return the term of the measured points with their noise at a state; None if there are too few, or hardly any lies on the surface."""

@@ -53,14 +53,10 @@ class ModeFits:
     by_rays: Float[Tensor, "g P P"]
 
     @property
-    def by_mode(self) -> Float[Tensor, "g h"]:
-        """The log evidence for each explanation, mode by mode; minus infinity for those of other modes."""
-        return torch.where(self.states.mode[None] == self.about.mode[:, None], self.weights[None], -torch.inf)
-
-    @property
     def likeliest(self) -> States:
         """The most probable state of each mode: as it was fitted, if the models are about the most probable explanations."""
-        best = self.states[self.by_mode.argmax(-1)]
+        member = self.states.mode[None] == self.about.mode[:, None]
+        best = self.states[torch.where(member, self.weights[None], -torch.inf).argmax(-1)]
         return self.about if torch.equal(best.row, self.about.row) else best
 
 

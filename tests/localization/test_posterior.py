@@ -10,10 +10,9 @@ import torch
 from torch import Generator, Tensor
 
 from bidnerf import SE3
-from bidnerf_core.localization import Loop, Posterior
+from bidnerf_core.localization import Posterior
 
 # Inside: explanations, the tolerance, relative to which the distances of the scene are varied, and a fit of terms in closed form
-from bidnerf_core.localization.explanations import Explanations
 from bidnerf_core.localization.posterior import TOLERANCE, ModeFits
 from bidnerf_core.mapping import (
     NUISANCES,
@@ -270,37 +269,3 @@ def test_matches_that_do_not_determine_the_pose_never_leave_a_certain_one(place:
         assert float(covariance.diagonal().max()) > 1
     one = torch.ones(1, dtype=torch.bool)
     assert found.mass(4.0, NOTHING, one) < 0.5
-
-
-@pytest.mark.parametrize(("agreeing", "camera"), [(90, "exact"), (110, "cropped")])
-def test_most_matches_on_a_wall_decide_on_the_camera_wherever_the_fit_begins(agreeing: int, camera: str) -> None:
-    """Of 200 matches, some agree with a cropped camera at a pose 0.3 m away, where the fit begins, the others with the stated one."""
-    m, generator = 200, Generator().manual_seed(0)
-    flat = 1.2 * (torch.rand((m, 2), generator=generator, dtype=torch.float64) - 0.5)
-    z = 3 + 0.3 * torch.rand((m, 1), generator=generator, dtype=torch.float64)
-    wall = replace(matches(0, m=m), points=TRUTH.apply(torch.cat([flat * z, z], -1))[None])
-
-    def seen_by(states: States, noise: float = 0.0) -> Landmarks:
-        errors = noise / FOCAL * torch.randn((m, 2), generator=generator, dtype=torch.float64)
-        image = project(states, wall.points[0], wall.sights[0]).image + errors
-        return replace(wall, sights=replace(wall.sights, image=image))
-
-    stated, shift = state(deviation(0 * CAMERA)), torch.tensor([0.0, 0.1, 0.05], dtype=torch.float64)
-    mean = torch.cat([shift, NO_SCATTER[3:]])[None]
-    away, _ = descend(replace(stated, mean=mean), [seen_by(stated)], 30)
-    mixed, other = seen_by(stated, 0.1), seen_by(away, 0.1)
-    mixed.sights.image[0, :agreeing] = other.sights.image[0, :agreeing]
-
-    cameras = [[0.0005] * 5 + [0.0], [0.01, 0.1, 0.1, 0.01, 0.001, 0.0]]
-    deviations = torch.stack([deviation(torch.tensor(each, dtype=torch.float64)) for each in cameras])
-    prior_odds = torch.tensor([0.4, 0.002], dtype=torch.float64).log()
-    still, sure = torch.tensor([False, False]), torch.tensor([True, True])
-    given = Explanations(("exact", "cropped"), still, 0 * deviations, deviations, prior_odds, sure, NO_SCATTER)
-    first = replace(away.under(NO_SCATTER, deviations[1]), log_prior=prior_odds[1:], row=torch.tensor([1]))
-    loop = object.__new__(Loop)
-    loop.device = torch.device("cpu")
-    fit = loop._settle_landmarks(first, mixed, given)
-
-    assert given.cameras[int(fit.likeliest.row)] == camera
-    error = float((fit.likeliest.T.translation - TRUTH.translation).norm())
-    assert error < 0.01 if camera == "exact" else error > 0.1
