@@ -66,7 +66,7 @@ TOO_SLOW = {
 """Commands that are only parsed: they take minutes, or the results of one that does, files of a plugin's, or run until stopped."""
 FIRST = {("info", "MAP", "--plot", "capture.png"): ("bake", "MAP", "--data", "DATA")}
 """Commands that need another one first, whose result the page's reader has from training."""
-OTHER_PROGRAMS = {"git", "cd", "cp", "mv", "perl", "pytest", "curl"}
+OTHER_PROGRAMS = {"dask", "export", "git", "cd", "cp", "mv", "perl", "pytest", "curl"}
 """Programs beside bidnerf, make and pip that the documentation runs; a test follows the template's commands elsewhere."""
 LANGUAGES = {"python", "sh", "toml", "bibtex", "text"}
 
