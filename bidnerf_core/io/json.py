@@ -17,6 +17,7 @@ import typing
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import GenericAlias
 from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar, cast
 
 from bidnerf_core.errors import InputError, spelling_hint
@@ -226,7 +227,7 @@ def with_tensors(plain: Any, tensors: Mapping[str, Tensor], where: str) -> Any:
     return tensors[name]
 
 
-def from_plain(kind: type[_T], value: Any, where: str) -> _T:
+def from_plain(kind: type[_T] | GenericAlias, value: Any, where: str) -> _T:
     """Convert ``value``, as read from JSON, to the type ``kind``: a dataclass, or a list, tuple or dict of these and of plain values.
 
     Missing keys take their defaults, and lists become tuples where ``kind`` has tuples. Raises ``InputError``, whose message begins with

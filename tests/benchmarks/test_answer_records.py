@@ -152,7 +152,7 @@ def test_two_files_are_compared(answers: ModuleType, tmp_path: Path, capsys: pyt
     first = write_rows(tmp_path / "a.jsonl", rows)
     answers.compare([first])
     lines = capsys.readouterr().out.splitlines()
-    assert "| room | RGB | all | 4 | 2 | 1 | 3 | 2 | 1/2 | 0.19 | 1.00 | 3.00 |" in lines
+    assert "| room | RGB | all | 4 | 2 | 1 | 3 | 2 | 1/2 | 0.46 | 1.00 | 3.00 |" in lines
     # Of ten answers that the first file has right, the second has none.
     right, wrong = [row(0.01, True)] * 10 + rows[:1], [row(9.0, True)] * 10 + rows[:1]
     answers.compare([write_rows(tmp_path / "b.jsonl", right), write_rows(tmp_path / "c.jsonl", wrong)])

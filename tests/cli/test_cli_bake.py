@@ -123,7 +123,7 @@ def test_a_baked_map_needs_no_start(sharp: Path, baked: Path, once: CommandResul
     assert (status, line in out) == (0, True)
     assert "capture.png: written" in err
     assert (folder.parent / "capture.png").read_bytes().startswith(b"\x89PNG")
-    assert_refused(bidnerf("info", folder, "--plot", folder.parent / "capture.jpg"), 2, "PNG")
+    assert_refused(bidnerf("info", folder, "--plot", folder.parent / "capture.jpg"), 2, ".png")
 
 
 @pytest.mark.usefixtures("_ball")

@@ -48,5 +48,5 @@ def fill(folder: Path) -> None:
     # What commands name that are only parsed.
     for name in ("PROJECT", "new-photos"):
         (folder / name).mkdir()
-    for name in ("splat.ply", "RESULTS.jsonl", "results.jsonl", "known.json"):
+    for name in ("splat.ply", "RESULTS.jsonl", "results.jsonl", "known.json", "page.html"):
         (folder / name).touch()
