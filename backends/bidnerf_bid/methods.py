@@ -65,7 +65,8 @@ def descend_from_start(
     Low-contrast images have a small loss even at a wrong pose, so newly drawn rays must also support the pose.
     """
     began, start, device = time.perf_counter(), problem.start, problem.device
-    assert start is not None  # a ``Localizer`` refuses queries without one
+    if start is None:
+        raise InputError(f"method {method!r} needs a start; give one, or use a method that needs none")
     if depth is not None and depth.depth_scale is None:
         depth = replace(depth, depth_scale=rendered_depth_scale(problem.bounds))
     objective, generator = objective_of(config.colour, depth), Generator(device).manual_seed(seed)

@@ -395,7 +395,8 @@ def support(
     against["displaced"] = float(log_odds(costs(many.retract_about(middle, steps)), here).min())
     if others is not None and len((far := others[~same_pose(T, others, middle)]).translation):
         against["other"] = float(log_odds(costs(far), here).min())
-    explained = None if plain is None else max(0.0, 1 - float(here.sum() / plain.sum()))
+    # An image without any contrast leaves nothing to explain.
+    explained = None if plain is None else max(0.0, 1 - float((here.sum() / plain.sum()).nan_to_num(1.0)))
     # The posterior probability of the pose, with equal prior odds against each rival.
     confidence = 1 / (1 + sum(odds(-each) for each in against.values()))
     return {**against, "confidence": confidence, "explained": explained}

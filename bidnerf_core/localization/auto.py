@@ -55,10 +55,10 @@ def answers(problem: Problem, config: AutoConfig, seed: int, loop: Loop | None) 
 
     A map with neither landmarks nor a surface has one answer, by a descent from the start.
     """
-    surface = problem.surface
+    began, surface = time.perf_counter(), problem.surface
     if loop is not None:
         if (answer := loop()) is not None:
-            yield answer.localization(problem, time.perf_counter())
+            yield answer.localization(problem, began)
     elif surface is None:
         why = "the map has no surface ('bidnerf bake' makes one)"
         if problem.start is None:
