@@ -5,7 +5,7 @@ The module also re-exports what backends need: the interfaces of fields and samp
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from threading import Lock
 from typing import Any, Generic, Protocol, TypeVar, cast, runtime_checkable
@@ -69,14 +69,18 @@ class Backend(Protocol):
         ...
 
 
-BACKENDS: Plugins[Backend] = Plugins(
-    "backends",
-    lambda backend: interface_defects(
-        backend,
-        ("summary", "config_type"),
-        {"build": ("config", "bounds"), "train": ("field", "views", "config", "report")},
-    ),
-)
+def backend_defects(backend: Any) -> Iterator[str]:
+    """Yield the reasons why an object does not implement ``Backend``."""
+    parameters = {"build": ("config", "bounds"), "train": ("field", "views", "config", "report")}
+    yield from interface_defects(backend, ("summary", "config_type"), parameters)
+    kind = backend.config_type
+    steps = getattr(kind(), "steps", None)
+    if type(steps) is not int or steps < 1:
+        found = "no field steps" if steps is None else f"steps = {steps!r}"
+        yield f"config_type {kind.__name__} has {found}, expected the number of training steps, such as 'steps: int = 1000'"
+
+
+BACKENDS: Plugins[Backend] = Plugins("backends", backend_defects)
 """All backends by name; a backend is imported when it is looked up."""
 
 

@@ -287,7 +287,7 @@ def interface_defects(plugin: Any, attributes: Sequence[str], methods: Mapping[s
     if isinstance(plugin, type):
         yield f"it is the class {plugin.__name__} itself, expected an instance of it"
     if "summary" in attributes and not isinstance(plugin.summary, str):
-        yield f"summary is {plugin.summary!r}, expected text"
+        yield f"summary is {plugin.summary!r}, expected one line of text"
     if "config_type" in attributes:
         kind, nothing = plugin.config_type, dataclasses.MISSING
         is_dataclass = isinstance(kind, type) and dataclasses.is_dataclass(kind)
@@ -296,6 +296,10 @@ def interface_defects(plugin: Any, attributes: Sequence[str], methods: Mapping[s
             yield f"config_type is {kind!r}, expected a frozen dataclass"
         if bare := [f.name for f in fields if f.default is f.default_factory is nothing]:
             yield f"config_type {kind.__name__} has no default for {', '.join(bare)}"
+        typed = inspect.get_annotations(kind) if is_dataclass else vars(kind)
+        for name, value in vars(kind).items():
+            if name not in typed and not name.startswith("_") and isinstance(value, str | int | float | tuple):
+                yield f"config_type {kind.__name__} has no type for {name}, expected '{name}: {type(value).__name__} = {value!r}'"
     for name, parameters in methods.items():
         method = plugin if name == "__call__" else getattr(plugin, name)
         try:

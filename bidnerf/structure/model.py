@@ -236,7 +236,15 @@ def reasons_left_out(
         reason = f"overlaps with {other}, judging by its {amount(keypoints[photo.number], 'keypoint')}, but too little with the placed ones"
         if rank is not None:
             size, part = amount(models[rank].num_reg_images(), "photo"), part_folder(Path(), rank)
-            reason = f"belongs to another model, with {size}, that has no connection to the largest: {part}"
+            shared = len({*models[rank].reg_image_ids()} & {*models[0].reg_image_ids()})
+            reason = (
+                f"belongs to another model, of {size}, that shares too few points with the largest to be joined: {part}"
+            )
+            reason += (
+                f"; {amount(shared, 'photo')} of it {'is' if shared == 1 else 'are'} in the largest as well"
+                if shared
+                else ""
+            )
         reasons[photo.shot.name] = reason
     return reasons
 

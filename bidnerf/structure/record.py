@@ -78,6 +78,7 @@ class FoundPoses:
 
     def __str__(self) -> str:
         parts, more = [part_folder(Path(), n).name for n in range(1, len(self.models))], len(self.left_out) - 5
+        others = f", or make maps of the other models too ('bidnerf train POSES/{parts[0]}')" if parts else ""
         lines = (
             f"poses of {self.placed} of {amount(self.photos, 'photo')}; {amount(self.points, 'point')}, mean error"
             f" {self.reprojection_error:.2f} px{'; in metres, by the measured depth' if self.metric and not self.geo_frame else ''}",
@@ -85,8 +86,9 @@ class FoundPoses:
             f" those of {self.geo_frame.crs} minus {', '.join(f'{part:.0f}' for part in self.geo_frame.origin)}"
             if self.geo_frame
             else "",
-            f"the photos fall into {len(self.models)} unconnected models of {', '.join(map(str, self.models))} photos;"
-            f" the largest is the dataset here, the others are datasets of their own in {', '.join(parts)}"
+            f"the photos fall into {len(self.models)} models of {', '.join(map(str, self.models))} photos, of which a photo may"
+            " be in several and which share too few points to be joined; the largest is the dataset here, the others are"
+            f" datasets of their own in {', '.join(parts)}"
             if parts
             else "",
             f"{amount(self.turned, 'photo')} turned by EXIF: the dataset has the cameras of the images as stored, while"
@@ -95,6 +97,9 @@ class FoundPoses:
             else "",
             *(f"left out {left.photo}: {left.reason}" for left in self.left_out[:5]),
             f"left out {more} more, see {RECORD}" if more > 0 else "",
+            f"most photos have no pose here: take more beside those left out, each to overlap the next by two thirds{others}"
+            if 2 * self.placed < self.photos
+            else "",
         )
         return "\n".join(filter(None, lines))
 

@@ -29,7 +29,7 @@ from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.datasets import HOLD_OUT_EVERY, POSERS, DatasetOptions, SparseChoice, lacks_poses
 from bidnerf_core.devices import move_to, working_device
 from bidnerf_core.errors import Cancelled, InputError, amount, enumeration
-from bidnerf_core.fields import NoField, device_of, trained_field
+from bidnerf_core.fields import NoField, SceneBounds, device_of, trained_field
 from bidnerf_core.frames import View
 from bidnerf_core.io import from_plain, pack_tensors, to_plain
 from bidnerf_core.mapping import (
@@ -153,6 +153,16 @@ def train(
     baking = bake_settings(bake)
     working_device(options.device)  # an invalid one is rejected before anything is read
     folder, known = None if out is None else Path(out), None
+    # So is a field that cannot be built; its bounds are not known yet.
+    bounds = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 6.0)
+    outline = MapInfo(backend, to_plain(settings, "config"), bounds, 0, False)
+    values = build_field(outline, str(folder or "train")).query(torch.zeros(2, 3), torch.eye(3)[:2])
+    shapes = tuple(values.density.shape), tuple(values.rgb.shape)
+    if shapes != ((2,), (2, 3)):
+        raise PluginError(
+            f"the field of backend {backend!r} returned density and rgb of shapes {shapes[0]} and {shapes[1]} at 2 points",
+            expected="(2,) and (2, 3), see FieldValues",
+        )
     if folder is not None and not options.overwrite:
         with contextlib.suppress(InputError):
             there = load_info(folder)
@@ -226,7 +236,6 @@ def train(
             origin=origin,
             gravity_up=read.gravity_up,
         )
-        build_field(info, str(folder or read.where))  # raises before anything is written
         scene = Map(info, NoField())
         # A map that is already there stays until the first checkpoint.
         if baking is not None and folder is not None and not (folder / DESCRIPTION).exists():

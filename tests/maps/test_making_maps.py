@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import make_dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,7 +17,7 @@ from torch import nn
 import bidnerf as bn
 import tiny
 from bidnerf.testing import training_views, unseen
-from bidnerf_core.backend import load_backend, quick_config
+from bidnerf_core.backend import FieldValues, Stratified, load_backend, quick_config
 from bidnerf_core.geometry import perturb
 from bidnerf_core.io import FileInUse, to_plain
 from bidnerf_core.localization import settings_of
@@ -320,21 +321,32 @@ def test_wrong_options_are_refused() -> None:
             bn.TrainOptions(**options)  # type: ignore[arg-type]
 
 
-def test_a_backend_whose_module_is_no_field_is_refused_before_training(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    class Layers(type(hashgrid)):  # type: ignore[misc]
-        def build(self, config: Any, bounds: Any) -> Any:
-            return nn.Linear(3, 4)
+class Column(nn.Module):
+    """A field whose density has an axis too many."""
 
-    kind = Layers(**vars(hashgrid))
-    monkeypatch.setattr("bidnerf_core.registry.registered", {("backends", "layers"): kind})
-    with refused(
-        where=tmp_path / "map",
-        found="backend 'layers' built a Linear",
-        expected="an nn.Module with query and sampler",
-    ):
-        bn.train(tiny.views(2), "layers", out=tmp_path / "map", bake=False)
+    sampler = Stratified(4)
+
+    def query(self, positions: torch.Tensor, directions: torch.Tensor) -> FieldValues:
+        return FieldValues(positions[..., :1], positions)
+
+
+@pytest.mark.parametrize(
+    ("members", "found"),
+    [
+        ({"build": lambda config, bounds: nn.Linear(3, 4)}, "backend 'mine' built a Linear"),
+        ({"build": lambda config, bounds: Column()}, "of shapes (2, 1) and (2, 3) at 2 points"),
+        ({"config_type": make_dataclass("Endless", [("size", int, 3)], frozen=True)}, "Endless has no field steps"),
+    ],
+)
+def test_a_backend_that_cannot_be_trained_is_refused_before_images_are_read(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, members: dict[str, Any], found: str
+) -> None:
+    kind = SimpleNamespace(
+        **{name: getattr(hashgrid, name) for name in ("summary", "config_type", "build", "train")} | members
+    )
+    monkeypatch.setattr("bidnerf_core.registry.registered", {("backends", "mine"): kind})
+    with refused(found=found):
+        bn.train(tmp_path / "no such images", "mine", out=tmp_path / "map", bake=False)
     assert not (tmp_path / "map").exists()
 
 

@@ -145,14 +145,16 @@ def names_of_reader(page: Path) -> dict[str, Any]:
     return {"sensor": moments, "camera": tiny.CAMERA}
 
 
-def execute(page: Path, containing: str = "") -> dict[str, Any]:
-    """Run the page's Python blocks, or those that contain a text, one after the other in one namespace, and return it."""
+def execute(page: Path, *containing: str) -> dict[str, Any]:
+    """Run the page's Python blocks, or those that contain one of these texts, one after the other in one namespace, and return it."""
     module = ModuleType(f"docs_{page.stem.replace('-', '_')}")
     sys.modules[module.__name__] = module  # where dataclasses look for the names of annotations
     namespace = vars(module)
     namespace.update(names_of_reader(page))
     for block in blocks(page, "python"):
-        if (page.name, block.text.splitlines()[0]) not in NOT_RUN and containing in block.text:
+        if (page.name, block.text.splitlines()[0]) not in NOT_RUN and any(
+            text in block.text for text in containing or [""]
+        ):
             padded = "\n" * (block.line - 1) + block.text  # errors then name the line of the page
             exec(compile(padded, str(page), "exec"), namespace)
     return namespace
@@ -259,12 +261,19 @@ def test_the_backend_of_the_documentation_trains_and_localizes(inside: Path) -> 
     assert after < 0.5 * before
 
 
+PAGE = execute(ROOT / "docs" / "extend.md", "backend = Fog()", "Mlp")
+
+
 @pytest.mark.slow
 class TestFog(BackendContract):
-    """The backend of the documentation, as it stands there, keeps the contract."""
+    """The first backend of the documentation, as it stands there, keeps the contract."""
 
-    page = execute(ROOT / "docs" / "extend.md", "backend = Fog()")
-    backend, config = page["backend"], page["FogConfig"](cells=16, steps=40)
+    backend, config = PAGE["backend"], PAGE["FogConfig"](cells=16, steps=40)
+
+
+@pytest.mark.slow
+class TestMlp(PAGE["TestMlp"]):  # type: ignore[misc]
+    """So does the second one, with the test and the config of the documentation."""
 
 
 def test_readme_is_short() -> None:

@@ -41,6 +41,7 @@ from dataclasses import dataclass
 @dataclass(frozen=True)
 class Config:
     size: int = 1
+    steps: int = 1
     parts: tuple = ()
 
 class Kind:
@@ -149,7 +150,7 @@ def test_a_strangers_backend_is_listed_and_loaded(site: Site, value: str) -> Non
 
 def test_a_module_may_itself_be_the_backend(site: Site) -> None:
     lines = ["from dataclasses import make_dataclass", "summary = 'a module'"]
-    lines += ["config_type = make_dataclass('Config', [], frozen=True)"]
+    lines += ["config_type = make_dataclass('Config', [('steps', int, 1)], frozen=True)"]
     lines += ["def build(config, bounds): ...", "def train(field, views, config, report): ..."]
     site.module("stranger_module.py", "\n".join(lines))
     site.plugin("module", "stranger_module")
@@ -257,11 +258,13 @@ def test_ctrl_c_during_an_import_stays_an_interruption(site: Site) -> None:
         ("backend = Kind()", "backend = None", "NoneType has no summary, config_type, build, train"),
         ("backend = Kind()", "backend = Config", "class Config has no summary, config_type, build, train"),
         ("backend = Kind()", "backend = Kind", "it is the class Kind itself, expected an instance of it"),
-        ('summary = "a field of fog"', "summary = 3", "summary is 3, expected text"),
+        ('summary = "a field of fog"', "summary = 3", "summary is 3, expected one line of text"),
         ("config_type = Config", "config_type = dict", "expected a frozen dataclass"),
         ("config_type = Config", "config_type = Config()", "expected a frozen dataclass"),
         ("@dataclass(frozen=True)", "@dataclass", "expected a frozen dataclass"),
         ("size: int = 1", "size: int", "config_type Config has no default for size"),
+        ("size: int = 1", "size = 1", "config_type Config has no type for size, expected 'size: int = 1'"),
+        ("steps: int = 1", "times: int = 1", "config_type Config has no field steps"),
         ("self, config, bounds", "self, config", "build does not take (config, bounds)"),
         ("self, field, views, config, report", "self", "train does not take (field, views, config, report)"),
         ("def build(self, config, bounds): ...", "build = 1", "build does not take (config, bounds)"),

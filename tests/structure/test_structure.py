@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 import sys
+from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -32,7 +33,7 @@ from bidnerf.structure.colmap import list_photos, to_colmap
 from bidnerf.structure.gps import align_to_gps
 from bidnerf.structure.joining import join
 from bidnerf.structure.matching import NEIGHBOURS, PARTNERS, candidate_pairs, chosen_pairs
-from bidnerf.structure.model import count_contradictions, from_colmap
+from bidnerf.structure.model import count_contradictions, from_colmap, reasons_left_out
 from bidnerf.structure.record import digest, open_work, remove_output
 from bidnerf.structure.sources import (
     FRAME_STEP,
@@ -132,16 +133,16 @@ def test_the_largest_of_several_models_is_kept_and_every_photo_accounted_for(sea
     assert (found.photos, found.placed, found.models) == (PLACED + OTHERS + 3, PLACED, (PLACED, OTHERS))
     reasons = {left.photo: left.reason for left in found.left_out}
     assert sorted(reasons) == ["100", "101", "102", "200", "201", "202"]
-    assert all("another model, with 3 photos" in reasons[name] for name in ("100", "101", "102"))
+    assert all("another model, of 3 photos" in reasons[name] for name in ("100", "101", "102"))
     assert "keypoint" in reasons["200"]
     assert "not readable as an image" in reasons["202"]
     assert "not readable as an image" in reasons["201"]
-    assert "2 unconnected models of 6, 3 photos; the largest is the dataset here" in str(found)
+    assert "2 models of 6, 3 photos, of which a photo may be in several and which share too few points" in str(found)
     assert json.loads((search.out / "poses.json").read_text())["placed"] == PLACED
 
 
 def test_another_scene_is_a_dataset_of_its_own(search: Search) -> None:
-    assert all(left.reason.endswith("largest: part-2") for left in search.found.left_out[:OTHERS])
+    assert all(left.reason.endswith("to be joined: part-2") for left in search.found.left_out[:OTHERS])
     assert "the others are datasets of their own in part-2" in str(search.found)
     views = {view.frame.name: view for view in bn.open_dataset(search.out / "part-2").views("all")}
     assert sorted(views) == ["100", "101", "102"]
@@ -149,6 +150,22 @@ def test_another_scene_is_a_dataset_of_its_own(search: Search) -> None:
     metres, degrees = errors(views, truth)
     assert metres < 0.03
     assert degrees < 2
+
+
+def test_models_that_share_photos_say_so_and_a_minority_is_advised(search: Search) -> None:
+    listed = [SimpleNamespace(number=number, shot=SimpleNamespace(name=f"{number}")) for number in range(7)]
+    models: list[Any] = [
+        SimpleNamespace(reg_image_ids=lambda: [0, 1, 2, 3], num_reg_images=lambda: 4),
+        SimpleNamespace(reg_image_ids=lambda: [3, 4, 5], num_reg_images=lambda: 3),
+    ]
+    photos: Any = SimpleNamespace(photos=listed, unusable={})
+    reasons = reasons_left_out(photos, models, Counter(), dict.fromkeys(range(7), 9))
+    assert sorted(reasons) == ["4", "5", "6"]
+    assert reasons["4"].endswith("to be joined: part-2; 1 photo of it is in the largest as well")
+    advice = "most photos have no pose here: take more"
+    assert advice not in str(search.found)
+    assert advice in str(replace(search.found, photos=30))
+    assert "'bidnerf train POSES/part-2'" in str(replace(search.found, photos=30))
 
 
 @pytest.mark.parametrize("shared", [0, 1])
