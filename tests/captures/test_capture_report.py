@@ -260,6 +260,17 @@ def test_the_errors_of_a_map_are_in_its_unit() -> None:
         assert any(shown in line for line in sentences(report, unit))
 
 
+@pytest.mark.parametrize("found", [1, 8])
+def test_the_forecast_is_of_landmarks_alone_and_a_lower_bound(found: int) -> None:
+    trial = HeldOutTrial(9, found, 0.00275, 0.034)
+    (forecast,) = [line for line in sentences(CaptureReport((), CoverageRecord(), trial=trial)) if "expect" in line]
+    was = "was" if found == 1 else "were"
+    assert f"without field or depth, {found} of 9 photos of the map {was} localized" in forecast
+    assert "expect this or better for new photos taken the same way" in forecast
+    nothing = CaptureReport((), CoverageRecord(), trial=HeldOutTrial(0, 0))
+    assert not [line for line in sentences(nothing) if "localized" in line]
+
+
 def test_groups_are_numbered_by_size() -> None:
     links = torch.zeros((9, 9), dtype=torch.bool)
     for i, j in [(0, 1), (1, 2), (3, 4), (4, 5), (5, 6), (7, 8)]:

@@ -634,7 +634,13 @@ def test_the_demo_leaves_a_map_and_the_data_that_it_was_made_from(
     made = bidnerf("demo", "--steps", 5, "--frames", 1, "--out", out)
     assert made.status == 0
     assert re.search(r"the field renders the 1 others with a PSNR of \d+\.\d dB", made.out)
-    (hint,) = [line for line in made.out.splitlines() if line.startswith("ask for a photo: bidnerf ")]
+    lines = made.out.splitlines()
+    (head,) = [line for line in lines if re.split(r"\s{2,}", line.strip())[:2] == ["frame", "method"]]
+    assert re.split(r"\s{2,}", head.strip())[2:] == ["error of the start", "error of the pose", "accepted", "CPU time"]
+    begun = [line.split()[:3] for line in lines[lines.index(head) + 1 :][:2]]
+    assert [(method, start == "none") for _, method, start in begun] == [("auto", True), ("bid", False)]
+    assert not [line for line in lines if line != line.rstrip()]
+    (hint,) = [line for line in lines if line.startswith("ask for a photo: bidnerf ")]
     assert bidnerf(*hint.split()[5:]).out.startswith("0000: ")
     data = open_dataset(out / "data")
     assert len(data.views("train")) == len(load_map(out / "map").info.cameras)

@@ -107,6 +107,8 @@ def test_a_summary_counts(results: list[TrialResult]) -> None:
     assert (slow.converged_but_wrong, slow.right_but_not_converged) == (0, 0)
     lied = dataclasses.replace(result(0, None), converged=True)
     assert summarize([lied]).converged_but_wrong == 1
+    busy = [dataclasses.replace(result(seed, 2), seconds=20.0 * seed, cpu_seconds=float(seed)) for seed in (1, 2, 9)]
+    assert (summarize(busy).seconds, summarize(busy).cpu_seconds) == (40, 2)  # medians of each
 
 
 class Page(NamedTuple):
@@ -461,6 +463,22 @@ def test_no_figure_has_more_conditions_or_steps_than_can_be_drawn(
     assert "5 further conditions in the tables are not drawn" in drawn[1]
     assert len(drawn[0].read_bytes()) < 200_000  # every step would take megabytes
     assert [group.label for group in figures.groups] == ["method 0", "method 1", "method 2"]
+
+
+def test_results_with_faults_are_drawn_beside_those_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = [result(seed, 2) for seed in range(3)]
+    faulty = [
+        dataclasses.replace(each, trial=dataclasses.replace(each.trial, fault=fault))
+        for fault in ("blur", "dark")
+        for each in plain
+    ]
+    figures, titles = Figures(group_results([*faulty, *plain]), tmp_path, "5deg 0.05"), list[str]()
+    monkeypatch.setattr(figures, "_figure", lambda name, panels, looks, caption: titles.extend(t for t, _ in panels))
+    figures.errors()
+    starts = list(dict.fromkeys(titles))
+    assert [title.rpartition(", ")[2] for title in starts[1:]] == ["blur", "dark"]
+    assert "blur" not in starts[0]
+    assert len(titles) == 9  # three kinds of curves for each
 
 
 def test_settings_of_matplotlib_do_not_count(tmp_path: Path) -> None:
