@@ -392,6 +392,21 @@ class Empty(TexturedGround):
         return FieldValues(torch.zeros_like(positions[..., 0]), torch.zeros_like(positions))
 
 
+@pytest.mark.parametrize("second", [0, 3, 5])
+@pytest.mark.parametrize("part", [(slice(None), slice(64, None)), (slice(48, None), slice(None))], ids=["side", "top"])
+def test_two_photos_in_one_image_are_two_views(part: tuple[slice, slice], second: int) -> None:
+    first, other = unseen().frame.replace(depth=None), training_views()[second].frame
+    rgb = first.rgb.clone()
+    rgb[part] = other.rgb[part]
+    localizer = Localizer(textured_map(), warm_up=False)
+    assert localizer(first).converged
+    found = localizer(first.replace(rgb=rgb))
+    assert found.outcome is Outcome.AMBIGUOUS, found.reason
+    assert "the image shows two views" in found.reason
+    mean = localizer(first.replace(rgb=(first.rgb + other.rgb) / 2))
+    assert not mean.converged, mean.reason
+
+
 @pytest.mark.parametrize("alike", [True, False])
 def test_all_rays_are_rendered_only_where_few_do_not_show_two_places_alike(
     alike: bool, monkeypatch: pytest.MonkeyPatch
