@@ -37,6 +37,7 @@ from bidnerf_core.installation import with_writer
 from bidnerf_core.io import (
     FileInUse,
     from_plain,
+    library_errors,
     open_binary,
     parse_json,
     read_file,
@@ -229,13 +230,11 @@ class ResultsFile:
 
     def _open(self, path: Path) -> BinaryIO:
         """Open the file, creating it if needed, and lock it."""
-        try:
+        with library_errors(path, "cannot be written", "a file", OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
             if path.exists():
                 open_binary(path, EXPECTED_RESULTS).close()  # raises for a pipe, which would wait for a reader
             self._file = path.open("a+b")
-        except OSError as error:
-            raise InputError(f"cannot be written ({error.strerror})", where=path, expected="a file") from error
         if not take_lock(self._file.fileno()):
             self.__exit__()
             raise FileInUse("another process is writing to it; name another file (`out`)", where=path)

@@ -21,10 +21,10 @@ from bidnerf_core.captures import (
     up_direction,
 )
 from bidnerf_core.devices import move_to
-from bidnerf_core.errors import InputError, printable
+from bidnerf_core.errors import printable
 from bidnerf_core.geometry import SE3, LengthUnit
 from bidnerf_core.installation import import_extra
-from bidnerf_core.io import write_file
+from bidnerf_core.io import library_errors, write_file
 from bidnerf_core.mapping import LandmarkMap, SurfaceMap
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
@@ -151,11 +151,9 @@ def draw_capture(
             if photo.problems:
                 panel.annotate(photo.name, camera, (4, 4), textcoords="offset points", fontsize=6)
         figure.legend(loc="outside lower center", ncols=4)
-        try:
+        with library_errors(out, "cannot be written", "a file in a folder that can be written", OSError):
             out.parent.mkdir(parents=True, exist_ok=True)
             write_figure(figure, out)
-        except OSError as error:
-            raise InputError(f"cannot be written ({error.strerror})", where=out) from error
 
 
 def draw_path(

@@ -32,7 +32,7 @@ from bidnerf_core.camera import MODELS, Camera, colmap_camera, read_text_cameras
 from bidnerf_core.depth import DepthImage, depth_image
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import is_file, open_arrays, read_database_table, read_file, read_lines
+from bidnerf_core.io import is_file, library_errors, open_arrays, read_database_table, read_file, read_lines
 from bidnerf_core.mapping import FIRST_CENTRE, Keypoints, quantize
 
 MODEL_FILE = "a file of a COLMAP sparse model"
@@ -295,13 +295,11 @@ def _of_database(path: Path, names: Iterable[str]) -> _Stored:
     }
     for number, *row in read_database_table(path, "descriptors", columns, expected):
         if number in keypoints:
-            try:
+            with library_errors(path, f"image {by_number[number]!r} is damaged", expected, ValueError, TypeError):
                 of_image, descriptors = (
                     np.frombuffer(data or b"", kind).reshape(rows, count)
                     for (rows, count, data), kind in ((keypoints[number], "<f4"), (row, "u1"))
                 )
-            except (ValueError, TypeError) as error:
-                raise InputError(f"image {by_number[number]!r}: {error}", where=path, expected=expected) from error
             yield by_number[number], of_image, _scales(of_image), descriptors
 
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from bidnerf_core.datasets.capture import BreaksOff
 from bidnerf_core.errors import InputError
 from bidnerf_core.installation import import_extra
-from bidnerf_core.io import LARGEST_IMAGE, looks_like_image, open_binary, reason
+from bidnerf_core.io import LARGEST_IMAGE, library_errors, looks_like_image, open_binary, reason
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".3gp", ".ts", ".mts")
 OPTIONS = {
@@ -42,10 +42,10 @@ class Video:
             found = [packet for packet in container.demux(stream) if packet.pts is not None]
             start = (container.start_time or 0) / 1e6  # microseconds
             shown = [(p.pts, float(p.pts * stream.time_base) - start) for p in found if not p.is_discard]
-        # Frames before the start are only needed to decode what follows.
-        shown = sorted(frame for frame in shown if frame[1] >= 0)
-        if not shown:
-            raise _no_video(path, "it has no frames")
+            # Frames before the start are only needed to decode what follows.
+            shown = sorted(frame for frame in shown if frame[1] >= 0)
+            if not shown:
+                raise ValueError("it has no frames")
         self._stamps, self.times = [stamp for stamp, _ in shown], [time for _, time in shown]
         self._open: ExitStack | None = None
         self._decoded: Iterator[Any] = iter(())
@@ -138,18 +138,12 @@ def _open_stream(path: Path) -> Iterator[tuple[Any, Any]]:
     Raises ``InputError`` if it is not a video, and, with what to install, if the extra ``video`` is missing.
     """
     av = import_extra("av", "video", "reading a video", path, "; or extract its frames to a folder")
-    try:
-        with av.open(str(path.resolve()), options=OPTIONS) as container:
-            if not container.streams.video:
-                raise _no_video(path, "it has no video stream")
-            stream = container.streams.video[0]
-            stream.codec_context.options = {"max_pixels": str(LARGEST_IMAGE)}
-            yield container, stream
-    except InputError:
-        raise
-    except (OSError, ValueError) as error:
-        raise _no_video(path, reason(error)) from error
-
-
-def _no_video(path: Path, why: str) -> InputError:
-    return InputError(f"not readable as a video ({why})", where=path, expected="a video file")
+    with (
+        library_errors(path, "not readable as a video", "a video file", OSError, ValueError),
+        av.open(str(path.resolve()), options=OPTIONS) as container,
+    ):
+        if not container.streams.video:
+            raise ValueError("it has no video stream")
+        stream = container.streams.video[0]
+        stream.codec_context.options = {"max_pixels": str(LARGEST_IMAGE)}
+        yield container, stream

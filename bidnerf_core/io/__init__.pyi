@@ -9,6 +9,7 @@ from .files import PackedFile as PackedFile
 from .files import available_memory as available_memory
 from .files import is_file as is_file
 from .files import is_temporary as is_temporary
+from .files import library_errors as library_errors
 from .files import lock as lock
 from .files import open_binary as open_binary
 from .files import output_folder as output_folder

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.io.allowance import Allowance
-from bidnerf_core.io.files import PackedFile, open_binary
+from bidnerf_core.io.files import PackedFile, library_errors, open_binary
 
 DAMAGES = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError, OSError)
 """Exceptions that the standard library raises for archives that are damaged or of an unsupported kind."""
@@ -23,16 +23,10 @@ class Archive:
         self.path, self._expected = path, expected
         with open_binary(path, expected) as file:
             begins = file.read(2)
-        try:
+        found = "ends too early, probably an incomplete copy" if begins == b"PK" else "is not a zip archive"
+        with library_errors(path, found, expected, *DAMAGES):
             self._zip = zipfile.ZipFile(path)
-            members = self._zip.infolist()
-        except DAMAGES as error:
-            raise InputError(
-                "ends too early, probably an incomplete copy" if begins == b"PK" else f"is not a zip archive ({error})",
-                where=path,
-                expected=expected,
-            ) from error
-        self._members = {member.filename: member for member in members}
+            self._members = {member.filename: member for member in self._zip.infolist()}
 
     @property
     def names(self) -> list[str]:
@@ -57,7 +51,5 @@ class Archive:
         if member is None:
             raise InputError(f"not found in the archive, which holds {amount(len(self._members), 'file')}", where=where)
         Allowance.of(self.path, self._expected, where).take(member.file_size)
-        try:
+        with library_errors(where, "cannot be unpacked", self._expected, *DAMAGES, RuntimeError):
             return self._zip.read(member)  # no more than it declares
-        except (*DAMAGES, RuntimeError) as error:
-            raise InputError(f"cannot be unpacked ({error})", where=where, expected=self._expected) from error

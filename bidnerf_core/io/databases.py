@@ -20,7 +20,7 @@ import numpy as np
 from bidnerf_core.errors import InputError
 from bidnerf_core.installation import import_extra
 from bidnerf_core.io.allowance import Allowance
-from bidnerf_core.io.files import open_binary, reason
+from bidnerf_core.io.files import library_errors, open_binary
 
 STEP = 10_000
 """Number of SQLite's instructions after which the total is checked. Reading a row takes about ten, and a row at least five bytes."""
@@ -41,20 +41,20 @@ def read_database_table(path: Path, table: str, columns: Sequence[str], expected
         reads = action == sqlite3.SQLITE_READ and name in (table, "sqlite_master")
         return sqlite3.SQLITE_OK if reads or action == sqlite3.SQLITE_SELECT else sqlite3.SQLITE_DENY
 
-    try:
-        address = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
-        with contextlib.closing(sqlite3.connect(address, uri=True)) as opened:
-            opened.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(max(size, 1000), 2**31 - 1))  # of a value
-            opened.set_authorizer(authorize)
-            opened.set_progress_handler(lambda: next(steps, None) is None, STEP)
-            for kind, text in opened.execute("SELECT type, sql FROM sqlite_master WHERE name = ?", (table,)):
-                if kind != "table" or "virtual" in str(text)[:20].lower():
-                    raise InputError(f"its {table!r} is a view, not a stored table", where=path, expected=expected)
-            for row in opened.execute(f"SELECT {', '.join(columns)} FROM {table}"):
-                allowance.take(sum(map(sys.getsizeof, row)))
-                yield row
-    except sqlite3.Error as error:
-        raise InputError(f"cannot be read: {reason(error)}", where=path, expected=expected) from error
+    address = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
+    with (
+        library_errors(path, "cannot be read", expected, sqlite3.Error),
+        contextlib.closing(sqlite3.connect(address, uri=True)) as opened,
+    ):
+        opened.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(max(size, 1000), 2**31 - 1))  # of a value
+        opened.set_authorizer(authorize)
+        opened.set_progress_handler(lambda: next(steps, None) is None, STEP)
+        for kind, text in opened.execute("SELECT type, sql FROM sqlite_master WHERE name = ?", (table,)):
+            if kind != "table" or "virtual" in str(text)[:20].lower():
+                raise InputError(f"its {table!r} is a view, not a stored table", where=path, expected=expected)
+        for row in opened.execute(f"SELECT {', '.join(columns)} FROM {table}"):
+            allowance.take(sum(map(sys.getsizeof, row)))
+            yield row
 
 
 @contextlib.contextmanager
@@ -89,10 +89,6 @@ def open_arrays(path: Path, expected: str) -> Iterator[Callable[..., np.ndarray 
         allowance.take(size)
         return np.asarray(found)
 
-    try:
-        with h5py.File(path, "r") as opened:
-            yield read
-    except InputError:
-        raise
-    except Exception as error:  # the library raises anything, such as RuntimeError for a damaged object
-        raise InputError(f"cannot be read: {reason(error)}", where=path, expected=expected) from error
+    # The library raises anything, such as RuntimeError for a damaged object.
+    with library_errors(path, "cannot be read", expected, Exception), h5py.File(path, "r") as opened:
+        yield read

@@ -89,6 +89,20 @@ def reason(error: Exception) -> str:
     return str(getattr(error, "strerror", None) or error).strip().partition("\n")[0][:120] or type(error).__name__
 
 
+@contextlib.contextmanager
+def library_errors(where: object, found: str, expected: str, *kinds: type[Exception]) -> Iterator[None]:
+    """Raise an ``InputError`` for an exception of a library in the block: ``found``, and the library's reason in parentheses.
+
+    ``kinds`` are the library's exceptions. An ``InputError`` of the block stays as it is.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except kinds as error:
+        raise InputError(f"{found} ({reason(error)})", where=where, expected=expected) from error
+
+
 def read_file(path: Path, expected: str, most: int = LARGEST_TEXT) -> bytes:
     """Return the content of a regular file. Raises ``InputError`` as ``open_binary`` does, and if the file exceeds ``most`` bytes."""
     with open_binary(path, expected) as file:
@@ -101,10 +115,8 @@ def read_open_file(file: BinaryIO, path: Path, expected: str, most: int = LARGES
     if size > most:
         found, limit = (f"{count / 2**20:,.0f} MiB" for count in (size, most))
         raise InputError(f"has {found}", where=path, expected=f"{expected} of at most {limit}")
-    try:
+    with library_errors(path, "cannot be read", expected, OSError):
         return file.read()
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path, expected=expected) from error
 
 
 def is_file(path: Path) -> bool:
@@ -237,16 +249,12 @@ def output_folder(
 
     check()
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
-    try:
-        with removed_on_failure():
-            out.mkdir(parents=True, exist_ok=True)
-            probe = temporary_name(out / "writable")
-            probe.write_bytes(b"")
-            probe.unlink()
-    except OSError as error:
-        raise InputError(
-            f"cannot be written ({error.strerror})", where=out, expected="a folder that can be created and written"
-        ) from error
+    expected = "a folder that can be created and written"
+    with library_errors(out, "cannot be written", expected, OSError), removed_on_failure():
+        out.mkdir(parents=True, exist_ok=True)
+        probe = temporary_name(out / "writable")
+        probe.write_bytes(b"")
+        probe.unlink()
     # The folder is removed while the lock is held: afterwards, it may belong to another process.
     with lock(out), removed_on_failure():
         check()  # another process may have finished meanwhile

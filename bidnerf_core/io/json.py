@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar, cast
 
 from bidnerf_core.errors import InputError, spelling_hint
 from bidnerf_core.io.allowance import Allowance
-from bidnerf_core.io.files import read_file, reason
+from bidnerf_core.io.files import library_errors, read_file
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -348,7 +348,7 @@ def parse_yaml(content: bytes, where: str, expected: str) -> dict[str, Any]:
     most, deepest = 2**20, 50
     if len(content) > most:
         raise InputError(f"has {len(content):,} bytes of YAML", where=where, expected=f"{expected} of at most {most:,}")
-    try:
+    with library_errors(where, "is not YAML", expected, yaml.YAMLError, ValueError, TypeError, RecursionError):
         text = re.sub(r"\A\s*%YAML.*\n", "", content.decode("utf-8-sig"))  # OpenCV's is malformed
         depth = 0
         for event in yaml.parse(text, Loader=loader):
@@ -356,8 +356,6 @@ def parse_yaml(content: bytes, where: str, expected: str) -> dict[str, Any]:
             if isinstance(event, yaml.AliasEvent) or depth > deepest:
                 raise yaml.YAMLError(f"aliases, or more than {deepest} lists and mappings within each other")
         found = next(iter(yaml.load_all(text, Loader=loader)), None)
-    except (UnicodeDecodeError, yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        raise InputError(f"is not YAML ({reason(error)})", where=where, expected=expected) from error
     if not isinstance(found, dict):
         raise InputError("has no entries", where=where, expected=expected)
     return found
@@ -382,11 +380,7 @@ def parse_xml(content: bytes, where: str, expected: str) -> Element:
         raise InputError(f"has more than {most:,} tags", where=where, expected=f"{expected} of fewer")
     prolog = expat.ParserCreate()
     prolog.StartDoctypeDeclHandler, prolog.StartElementHandler = refuse, begin
-    try:
+    with library_errors(where, "is no XML", expected, expat.ExpatError, ElementTree.ParseError, ValueError):
         with contextlib.suppress(StopIteration):
             prolog.Parse(content, True)
         return ElementTree.fromstring(content)
-    except InputError:
-        raise
-    except (expat.ExpatError, ElementTree.ParseError, ValueError) as error:
-        raise InputError(f"is no XML ({reason(error)})", where=where, expected=expected) from error

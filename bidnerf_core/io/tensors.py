@@ -24,7 +24,7 @@ from torch.utils._pytree import tree_leaves
 from bidnerf_core.errors import InputError
 from bidnerf_core.io.allowance import Allowance
 from bidnerf_core.io.archives import Archive
-from bidnerf_core.io.files import PackedFile, open_binary, reason
+from bidnerf_core.io.files import PackedFile, library_errors, open_binary
 
 _Part = TypeVar("_Part")
 
@@ -36,14 +36,10 @@ def read_array(path: Path | PackedFile, expected: str) -> np.ndarray:
 
     ``expected`` briefly describes what the file should be.
     """
-    try:
-        with open_binary(path, expected) as file:
-            array: np.ndarray = np.lib.format.read_array(file, allow_pickle=False)
-            return array
-    except InputError:
-        raise
-    except Exception as error:  # NumPy parses the header as Python, which may raise anything
-        raise InputError(f"not readable as an array ({reason(error)})", where=path, expected=expected) from error
+    # NumPy parses the header as Python, which may raise anything.
+    with library_errors(path, "not readable as an array", expected, Exception), open_binary(path, expected) as file:
+        array: np.ndarray = np.lib.format.read_array(file, allow_pickle=False)
+        return array
 
 
 def read_tensors(path: Path, expected: str = TENSOR_FILE) -> dict[str, Tensor]:
@@ -56,19 +52,17 @@ def read_tensors_and_metadata(path: Path, expected: str = TENSOR_FILE) -> tuple[
 
     Raises ``InputError`` if the file is not a safetensors file, or if its length contradicts its header.
     """
-    with open_binary(path, expected) as file:
-        try:
-            length = int.from_bytes(file.read(8), "little")  # of the header
-            if not 0 < length <= os.fstat(file.fileno()).st_size - 8:
-                raise ValueError("its header is truncated")
-            file.seek(0)
-            content = file.read()
-            tensors = tensors_from_bytes(content)  # checks the header against the length of the content
-            if max((tensor.dim() for tensor in tensors.values()), default=0) > 64:
-                raise ValueError("a tensor has more than 64 axes, on which torch cannot compute")
-            return tensors, json.loads(content[8 : 8 + length]).get("__metadata__") or {}
-        except (SafetensorError, KeyError, ValueError, RuntimeError, OverflowError, OSError) as error:
-            raise InputError(f"not readable ({error})", where=path, expected=expected) from error
+    damages = SafetensorError, KeyError, ValueError, RuntimeError, OverflowError, OSError
+    with open_binary(path, expected) as file, library_errors(path, "not readable", expected, *damages):
+        length = int.from_bytes(file.read(8), "little")  # of the header
+        if not 0 < length <= os.fstat(file.fileno()).st_size - 8:
+            raise ValueError("its header is truncated")
+        file.seek(0)
+        content = file.read()
+        tensors = tensors_from_bytes(content)  # checks the header against the length of the content
+        if max((tensor.dim() for tensor in tensors.values()), default=0) > 64:
+            raise ValueError("a tensor has more than 64 axes, on which torch cannot compute")
+        return tensors, json.loads(content[8 : 8 + length]).get("__metadata__") or {}
 
 
 @dataclass(frozen=True)
@@ -173,12 +167,8 @@ def read_saved(path: Path, expected: str, mapped: bool = False) -> Any:
             expected=expected,
         ) from error
     allowance = Allowance.of(path, expected)
-    try:
+    with library_errors(path, "contains itself, or too many parts within each other", expected, RecursionError):
         for leaf in tree_leaves(content):
             if isinstance(leaf, Tensor) and not mapped:  # those that stay in the file take no memory
                 allowance.take(leaf.numel() * leaf.element_size())
-    except RecursionError as error:
-        raise InputError(
-            "contains itself, or too many parts within each other;", where=path, expected=expected
-        ) from error
     return content
