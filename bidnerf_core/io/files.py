@@ -31,14 +31,6 @@ class PackedFile:
     where: str  # the archive and the name in it, for messages
     read: Callable[[], bytes]  # returns its content, or raises ``InputError``
 
-    @property
-    def name(self) -> str:
-        return self.where.rpartition("/")[2]
-
-    @property
-    def suffix(self) -> str:
-        return Path(self.name).suffix
-
     def __str__(self) -> str:
         return self.where
 
