@@ -247,7 +247,7 @@ class Run:
         finally:  # however the run ended: also by Ctrl-C, SIGTERM, a closed pipe or a full disk
             with defer_interruptions():
                 if is_whole and total > 1:
-                    more = f" in {len(answers.scene)} maps" if isinstance(answers.scene, MapCollection) else ""
+                    more = f" in {len(answers.scene.names)} maps" if isinstance(answers.scene, MapCollection) else ""
                     hint = "; --out poses.json writes all poses" if out is None and not self.output.json else ""
                     say(f"{len(answers.accepted)} of {total} accepted{more}{hint}")
                 if is_whole and answers.world_mismatch is not None:

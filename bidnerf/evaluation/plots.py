@@ -232,9 +232,9 @@ def _set_logarithmic(axes: Any, name: str) -> None:
     axes.grid(which="major")
 
 
-def _wrap(text: str, width: float, lines: int = 4) -> str:
-    """Wrap each line of text to a width (inches), truncated to ``lines`` lines."""
-    wrap = partial(textwrap.wrap, width=int(width * PER_INCH), max_lines=lines, placeholder=" ...")
+def _wrap(text: str, width: float) -> str:
+    """Wrap each line of text to a width (inches), truncated to four lines."""
+    wrap = partial(textwrap.wrap, width=int(width * PER_INCH), max_lines=4, placeholder=" ...")
     return "\n".join("\n".join(wrap(line)) or line for line in text.split("\n"))
 
 

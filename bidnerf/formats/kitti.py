@@ -10,7 +10,6 @@ Principal points are relative to the centre of the upper left pixel, so half a p
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -50,9 +49,8 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
     if gone := sorted(set(range(listed)).difference(numbers)):
         warn_about(path, f"{len(gone)} of {amount(listed, 'image')} are missing, first: number {gone[0]}")
     by_name = {i.stem: poses[n] for i, n in zip(images, numbers, strict=True) if n < len(poses)}
-    shots = KITTI.shots(images, camera, poses=by_name)
-    times = [rows[number].numbers(count=1)[0] if number < len(rows) else None for number in numbers]
-    shots = [replace(shot, time=time) for shot, time in zip(shots, times, strict=True)]
+    times = {i.stem: rows[n].numbers(count=1)[0] for i, n in zip(images, numbers, strict=True) if n < len(rows)}
+    shots = KITTI.shots(images, camera, poses=by_name, times=times)
     return Capture(
         path, shots, options.colour, "metres", pose_file=file, poses_expected=f"poses.txt in it, or ../../poses/{name}"
     )

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from glob import glob
 from pathlib import Path
+from types import MappingProxyType
 
 from bidnerf_core.camera import Camera, CameraSource
 from bidnerf_core.datasets import IMAGE_ENDINGS, DepthFile, Shot, read_pose_matrix
@@ -62,11 +63,12 @@ class Layout:
         unit: float = MILLIMETRE,
         sensor: DepthCamera | None = None,
         poses: Mapping[str, SE3 | None] | None = None,
+        times: Mapping[str, float] = MappingProxyType({}),
     ) -> list[Shot]:
         """Return the images with their poses, and depth in steps of ``unit`` metres, which is registered if there is a ``sensor``.
 
         The ``camera`` may be a function that reads it from the file of each image, given its size. ``poses`` by name take the
-        place of files with a 4x4 matrix each. Raises ``InputError`` for an invalid pose, and as the function does.
+        place of files with a 4x4 matrix each; ``times`` are seconds by name. Raises ``InputError`` for an invalid pose, and as the function does.
         """
         read_depth, shots = DepthReader(self.unmeasured), list[Shot]()
         for image in images:
@@ -80,6 +82,7 @@ class Layout:
                     if isinstance(camera, Camera | CameraSource)
                     else camera(file, read_header(image).size),
                     T_world_camera=read_pose_matrix(pose) if poses is None else poses.get(name),
+                    time=times.get(name),
                     depth=DepthFile(depth, partial(read_depth, depth, unit), sensor) if is_file(depth) else None,
                 )
             )

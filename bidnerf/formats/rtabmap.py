@@ -9,7 +9,6 @@ name are those of the robot, and a remark says so.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 from bidnerf.formats.layouts import Layout
@@ -54,11 +53,9 @@ def _read(path: Path, images: list[Path], options: DatasetOptions) -> Capture:
             warn_about(
                 file, "is taken for poses of the robot, from which those of its camera follow by local_transform"
             )
-    shots = RTABMAP.shots(images, read_camera, unit, poses=poses)
-    shots = [replace(shot, time=times.get(shot.stem)) for shot in shots]
     return Capture(
         path,
-        shots,
+        RTABMAP.shots(images, read_camera, unit, poses=poses, times=times),
         options.colour,
         "metres",
         depth_unit=unit,

@@ -77,16 +77,13 @@ def standard_deviations(covariance: Float[Tensor, "6 6"]) -> tuple[float, float]
     return position, rotation
 
 
-def within(
-    estimated: SE3, true: SE3, covariance: Float[Tensor, "*c 6 6"], probability: float = 0.95
-) -> Bool[Tensor, "*b"]:
-    """Return whether the error of ``estimated`` lies within the confidence bound that its covariance implies.
+def within(estimated: SE3, true: SE3, covariance: Float[Tensor, "*c 6 6"]) -> Bool[Tensor, "*b"]:
+    """Return whether the error of ``estimated`` lies within the 95 % confidence bound that its covariance implies.
 
-    The bound is the quantile of the chi-squared distribution with 6 degrees of freedom, 12.59 for 0.95. If
-    the covariances are consistent, that fraction of errors lies within the bound. The result is False if the
-    covariance has no inverse.
+    The bound is the quantile of the chi-squared distribution with 6 degrees of freedom, 12.59. If the covariances are
+    consistent, 95 % of the errors lie within the bound. The result is False if the covariance has no inverse.
     """
-    return normalized_error_squared(estimated, true, covariance) <= chi_squared_quantile(probability, 6)
+    return normalized_error_squared(estimated, true, covariance) <= chi_squared_quantile(0.95, 6)
 
 
 def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
@@ -158,11 +155,6 @@ class Rate:
     @property
     def rate(self) -> float:
         return self.successes / self.trials
-
-    def __str__(self) -> str:
-        count = f"{self.successes} of {self.trials}"
-        on = "" if self.frames is None else f" on {self.frames} frame{'' if self.frames == 1 else 's'}"
-        return f"{self.rate:.1%} ({count}{on}; {self.low:.1%} to {self.high:.1%})"
 
 
 def success_rate(successes: int, trials: int, effective: float = 0.0, frames: int | None = None) -> Rate:

@@ -85,23 +85,18 @@ def write_figure(figure: Any, *paths: Path, dpi: int = 150) -> None:
     """Write a figure atomically to each path, in the format of its suffix.
 
     The text in the figure, which includes names of files, frames and settings, is made printable and
-    truncated to a drawable length.
+    truncated to 200 characters a line.
     """
     from matplotlib.text import Text
 
     for text in figure.findobj(Text):
-        text.set_text(_drawable(text.get_text()))
+        lines = (printable(line) for line in text.get_text().split("\n"))
+        text.set_text("\n".join(line if len(line) <= 200 else line[:197] + "..." for line in lines))
     for path in paths:
         file, suffix = io.BytesIO(), path.suffix.lstrip(".") or "png"
         figure.savefig(file, format=suffix, dpi=dpi, metadata={"Date": None} if suffix == "svg" else {})
         write_file(path, file.getvalue())
         figure.set_layout_engine("none")  # laying it out again would take as long as drawing it
-
-
-def _drawable(text: str) -> str:
-    """Return text without unprintable characters, with each line truncated to 200 characters."""
-    lines = (printable(line) for line in text.split("\n"))
-    return "\n".join(line if len(line) <= 200 else line[:197] + "..." for line in lines)
 
 
 def line_style(number: int) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from bidnerf.testing.faults import (
     are_colours,
     calling,
     equal,
+    generator,
     is_depth,
     is_one_line,
     is_refused,
@@ -337,7 +338,7 @@ class FaultContract(Named):
 
     def test_fault_of_depth_needs_depth(self) -> None:
         fault, bare = self._fault, _frame().replace(depth=None)
-        refused = not fault.needs_depth or is_refused(lambda: fault.change(bare, fault.sizes[0], _generator()))
+        refused = not fault.needs_depth or is_refused(lambda: fault.change(bare, fault.sizes[0], generator()))
         require(self._who, (refused, "changes depth, but accepts an image without it, expected an InputError"))
 
     @property
@@ -346,17 +347,13 @@ class FaultContract(Named):
 
     def _change(self, frame: Frame, size: float) -> Frame:
         with calling(f"{self._who} of size {size:g}"):
-            return self._fault.change(frame, size, _generator())
+            return self._fault.change(frame, size, generator())
 
 
 def _frame() -> Frame:
     frame = training_views()[0].frame
     assert frame.depth is not None
     return replace(frame, rgb=frame.rgb.clone(), depth=frame.depth.float().clone())
-
-
-def _generator() -> torch.Generator:
-    return torch.Generator().manual_seed(7)
 
 
 def _same(a: Frame, b: Frame) -> bool:

@@ -44,6 +44,11 @@ def calling(doing: str, passing: type[Exception] = AssertionError) -> Iterator[N
         raise AssertionError(f"{doing} raised {type(error).__name__}: {error}") from error
 
 
+def generator() -> Generator:
+    """Return a generator of random numbers that are the same at each call."""
+    return torch.Generator().manual_seed(7)
+
+
 def equal(a: Tensor | None, b: Tensor | None) -> bool:
     """Return whether two optional tensors are equal, or both None."""
     return a is b or (a is not None and b is not None and torch.equal(a, b))

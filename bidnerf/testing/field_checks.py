@@ -7,9 +7,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import torch
 from jaxtyping import Float
-from torch import Generator, Tensor
+from torch import Tensor
 
-from bidnerf.testing.faults import calling, query, require, sample
+from bidnerf.testing.faults import calling, generator, query, require, sample
 from bidnerf.testing.scene import (
     SIDE,
     awkward_points,
@@ -254,7 +254,7 @@ def check_intervals(field: RadianceField) -> None:
     Rays that miss the scene must have no valid samples, and batches without rays must be accepted.
     """
     for of, rays in awkward_rays().items():
-        for jitter, how in ((None, ""), (_generator(), " with jitter")):
+        for jitter, how in ((None, ""), (generator(), " with jitter")):
             samples = sample(field, rays, of + how, jitter)
             starts, ends, valid = samples.starts, samples.ends, samples.valid
             reached = torch.where(valid, ends, -torch.inf).cummax(-1).values if starts.shape[-1] else ends
@@ -295,7 +295,7 @@ def check_repeatable(field: RadianceField) -> None:
     rays = Rays.joined(awkward_rays().values())
     with torch.random.fork_rng(devices=[]):
         twice = [sample(field, rays, "rays") for _ in range(2)]
-        jittered = [sample(field, rays, "rays with jitter", _generator()) for _ in range(2)]
+        jittered = [sample(field, rays, "rays with jitter", generator()) for _ in range(2)]
 
     def same(a: RaySamples, b: RaySamples) -> bool:
         return all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("starts", "ends", "valid"))
@@ -315,7 +315,7 @@ def check_rays_alone(field: RadianceField) -> None:
     rays = Rays.joined(awkward_rays().values())
     count = len(rays.near) // 4 * 4
     whole = render_channels(field, rays[:count], "rays")
-    order = torch.randperm(count, generator=_generator())
+    order = torch.randperm(count, generator=generator())
     permuted = render_channels(field, rays[order.reshape(4, -1)], "rays in another order").reshape(-1, 5)
     alone = torch.cat([render_channels(field, rays[i : i + 1], "a ray") for i in range(0, count, 7)])
     expected = "expected each ray to be sampled for itself"
@@ -345,11 +345,13 @@ def check_levels(field: RadianceField) -> None:
     """Check that each level is a field, and that the last level renders like the field itself."""
     offered = tuple(getattr(field, "levels", None) or (field,))
     expected = "expected a field: an object with sampler and query"
-    for number, level in enumerate(offered):
-        require(
-            type(field).__name__,
-            (isinstance(level, RadianceField), f"levels[{number}] is a {type(level).__name__}, {expected}"),
-        )
+    require(
+        type(field).__name__,
+        *(
+            (isinstance(level, RadianceField), f"levels[{number}] is a {type(level).__name__}, {expected}")
+            for number, level in enumerate(offered)
+        ),
+    )
     rays = Rays.joined(awkward_rays().values())
     require(
         f"{type(field).__name__}.levels",
@@ -420,7 +422,3 @@ def render_channels(field: RadianceField, rays: Rays, of: str) -> Tensor:
         rendering = render(field, rays, BACKGROUND)
     channels = [rendering.rgb, rendering.distance[..., None], rendering.opacity[..., None]]
     return torch.cat(channels, dim=-1)
-
-
-def _generator() -> Generator:
-    return torch.Generator().manual_seed(3)

@@ -18,6 +18,7 @@ from bidnerf.testing.scene import DIMMED_BOUNDS, SCENE_BOUNDS, camera_rays, expo
 from bidnerf_core.backend import Backend
 from bidnerf_core.fields import RadianceField, SceneBounds, render
 from bidnerf_core.frames import View
+from bidnerf_core.io import pack_tensors
 from bidnerf_core.training import TrainingState, TrainingStep, TrainingStopped
 
 EXPOSURE = 0.06
@@ -55,8 +56,7 @@ class Recorder:
 def round_trip(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Return the tensors after a round trip through the safetensors format."""
     with calling("writing the tensors of a state to safetensors"):
-        packed = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
-        return tensors_from_bytes(tensors_to_bytes(packed))
+        return tensors_from_bytes(tensors_to_bytes(pack_tensors(tensors)))
 
 
 def copy_state(field: Any) -> dict[str, Tensor]:

@@ -60,14 +60,12 @@ def coverage(
     matched: TrackedKeypoints,
     seen: TrackedKeypoints,
     positions: Float[Tensor, "n 3"],
-    least_parallax: float,
     up: UpDirection | None = None,
 ) -> CoverageRecord:
     """Measure how well the views cover their scene.
 
     ``matched`` holds all matched keypoints, ``seen`` those consistent with a triangulated point, and ``positions`` these
-    points (metres, world). ``least_parallax`` is the angle (degrees) between rays below which a point cannot be
-    triangulated. ``up`` is the upward direction of the scene; by default, it is estimated from the cameras.
+    points (metres, world). ``up`` is the upward direction of the scene; by default, it is estimated from the cameras.
     """
     angle = _median(_cones_deg(matched))
     centres = torch.stack([v.T_ref_camera.translation.cpu().double() for v in views])
@@ -86,7 +84,7 @@ def coverage(
     open_side, gaps, heights = None, tuple[Gap, ...](), _range_deg(axes @ upward)
     if converge or not surrounded:
         arrangement, open_side, gaps, heights = _around(views, centres - centre, upward)
-    if matched.count and angle < least_parallax:
+    if matched.count and angle < DEFAULT_LANDMARKS.parallax:  # below which a point cannot be triangulated
         arrangement, open_side, gaps = "one place", None, ()
     views_of = torch.bincount(seen.point).double()
     return CoverageRecord(

@@ -30,7 +30,6 @@ from bidnerf_core.mapping import (
     ENOUGH_IMAGES,
     HeldOutTrial,
     ImageKeypoints,
-    LandmarkConfig,
     TrackedKeypoints,
     TrackedViews,
     pose_updates,
@@ -45,7 +44,6 @@ LEAST_GROUP = 3
 def survey_capture(
     tracked: TrackedViews,
     views: Sequence[View],
-    config: LandmarkConfig = DEFAULT_LANDMARKS,
     trial: HeldOutTrial | None = None,
     up: UpDirection | None = None,
 ) -> CaptureReport:
@@ -55,7 +53,7 @@ def survey_capture(
     and mirrored; this distinguishes a wrong pose from a photo of something else. ``trial`` holds the errors of
     held-out photos, and ``up`` is the upward direction of the scene, if known.
     """
-    seen, positions = tracked.triangulate(config)
+    seen, positions = tracked.triangulate(DEFAULT_LANDMARKS)
     links = link_photos(seen)
     sharp, overexposed, underexposed = photo_measures(views)
     group = groups(links)
@@ -63,7 +61,7 @@ def survey_capture(
     count = torch.bincount(seen.image, minlength=len(views))
     doubtful = suspects(seen, links)
     posed: dict[int, Relocation | None] = dict(_by_own_landmarks(seen, positions, views))
-    posed |= dict.fromkeys(doubtful) | relocate_photos(tracked, views, doubtful, config)
+    posed |= dict.fromkeys(doubtful) | relocate_photos(tracked, views, doubtful)
     exposure, sharpness = exposures(views, seen), excess(sharp, near)
     compared = exposure.isfinite()
     is_badly_exposed = torch.maximum(excess(overexposed, near), excess(underexposed, near)) > 0.25
@@ -113,7 +111,7 @@ def survey_capture(
     low, high = exposure.nan_to_num().quantile(torch.tensor([0.1, 0.9], dtype=exposure.dtype))
     return CaptureReport(
         tuple(photos),
-        coverage(sound, tracked.matched, seen, positions, config.parallax, up),
+        coverage(sound, tracked.matched, seen, positions, up),
         trial or HeldOutTrial(),
         float(high - low),
     )
@@ -231,9 +229,7 @@ def _has_support(images: Sequence[ImageKeypoints], links: csr_array, number: int
     return len(list(islice(agreeing, needed))) == needed
 
 
-def relocate_photos(
-    tracked: TrackedViews, views: Sequence[View], numbers: Sequence[int], config: LandmarkConfig
-) -> dict[int, Relocation]:
+def relocate_photos(tracked: TrackedViews, views: Sequence[View], numbers: Sequence[int]) -> dict[int, Relocation]:
     """Localize the photos ``numbers`` with landmarks built without them; photos that cannot be localized are left out.
 
     If several poses explain a photo, as in a building with identical rooms, the pose nearest to the given
@@ -242,7 +238,7 @@ def relocate_photos(
     if not numbers:
         return {}
     try:
-        matcher = LandmarkMatcher(tracked.without(numbers).landmarks(config))
+        matcher = LandmarkMatcher(tracked.without(numbers).landmarks(DEFAULT_LANDMARKS))
     except InputError:  # the other photos do not overlap
         return {}
     answers: dict[int, Relocation] = {}

@@ -36,7 +36,6 @@ from bidnerf_core.mapping import (
     USUAL_FEATURES,
     Adjustment,
     ImageKeypoints,
-    LandmarkConfig,
     PosePrior,
     TrackedKeypoints,
     TrackedViews,
@@ -219,7 +218,6 @@ def training_poses(
     tracked: TrackedViews,
     views: Sequence[View],
     least: float = INCONSISTENT,
-    config: LandmarkConfig = DEFAULT_LANDMARKS,
 ) -> TrainingPoses:
     """Return the poses with which to train on ``views``, whose keypoints are ``tracked``.
 
@@ -227,18 +225,18 @@ def training_poses(
     landmarks of the other photos. All poses are refined if errors of the given poses add at least ``least`` pixels to the
     standard deviation of the keypoints; otherwise they are kept.
     """
-    seen, points = tracked.triangulate(config)
+    seen, points = tracked.triangulate(DEFAULT_LANDMARKS)
     wrong = {
         number: photo
-        for number, photo in relocate_photos(tracked, views, suspects(seen, link_photos(seen)), config).items()
+        for number, photo in relocate_photos(tracked, views, suspects(seen, link_photos(seen))).items()
         if photo.problem in ("badly posed", "turned")
     }
     replaced = list(wrong)
     if wrong:
         updates = torch.zeros(len(views), 6, dtype=torch.float64)
         updates[replaced] = torch.stack([photo.update for photo in wrong.values()])
-        tracked = tracked.at(tracked.T_world_camera.retract(updates)).rematch(config, seen, points)
-    fit = adjust_poses(tracked, config, least)
+        tracked = tracked.at(tracked.T_world_camera.retract(updates)).rematch(DEFAULT_LANDMARKS, seen, points)
+    fit = adjust_poses(tracked, least)
     pixels, refined = torch.zeros(len(views), dtype=torch.float64), False
     if fit is not None and fit[2].inconsistency >= least:
         (tracked, pixels, _), refined = fit, True
@@ -246,14 +244,14 @@ def training_poses(
         poses, better = tracked.T_world_camera, fit[0].T_world_camera
         poses.rotation[replaced] = better.rotation[replaced]
         poses.translation[replaced] = better.translation[replaced]
-        tracked = tracked.at(poses).rematch(config, *fit[0].triangulate(config))
+        tracked = tracked.at(poses).rematch(DEFAULT_LANDMARKS, *fit[0].triangulate(DEFAULT_LANDMARKS))
     for number, photo in wrong.items():
         pixels[number] = photo.pixels
     return TrainingPoses(tracked, pixels, replaced, refined, None if fit is None else fit[2])
 
 
 def adjust_poses(
-    tracked: TrackedViews, config: LandmarkConfig, least: float = 0.0
+    tracked: TrackedViews, least: float = 0.0
 ) -> tuple[TrackedViews, Float[Tensor, "v"], PoseRefinement] | None:
     """Bundle-adjust the poses and points of the ``tracked`` images; None if there are too few images or points.
 
@@ -271,7 +269,7 @@ def adjust_poses(
         return max(LEAST_NOISE, noise(seen.sightings, points))
 
     given = tracked.T_world_camera
-    seen, points = tracked.triangulate(config)
+    seen, points = tracked.triangulate(DEFAULT_LANDMARKS)
     before = noise_of(seen, points)
     updates = list(pose_updates(seen, points).values())
     if len(updates) < ENOUGH_IMAGES:
@@ -291,7 +289,7 @@ def adjust_poses(
         deviations = max(deviations[0], moved[0]), max(deviations[1], moved[1])
         pixels = _image_motion(seen, fit.points, given, fit.T_world_camera)
         tracked, noticed = tracked.at(fit.T_world_camera, fit.motion), False
-        seen, points = tracked.triangulate(config)
+        seen, points = tracked.triangulate(DEFAULT_LANDMARKS)
         # A motion found in the last round could not be estimated any more.
         if motion == STILL and number < ROUNDS - 1:
             motion = common_motion(seen, points, KEYPOINTS_PER_INDEPENDENT)
@@ -299,8 +297,8 @@ def adjust_poses(
         consistency = PoseRefinement(before, noise_of(seen, points))
         if number == 0 and not noticed and consistency.inconsistency < least:
             break
-        tracked = tracked.rematch(config, seen, points)
-        seen, points = tracked.triangulate(config)
+        tracked = tracked.rematch(DEFAULT_LANDMARKS, seen, points)
+        seen, points = tracked.triangulate(DEFAULT_LANDMARKS)
         consistency = PoseRefinement(before, noise_of(seen, points))
         if float(step.max()) <= 0.25 and not noticed:  # pixels
             break

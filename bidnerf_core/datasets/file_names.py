@@ -75,9 +75,9 @@ class FileNames:
                         return file
         return None
 
-    def path(self, name: str | PurePosixPath, endings: tuple[str, ...] = ("",), moved: bool = False) -> Path:
+    def path(self, name: str | PurePosixPath, moved: bool = False) -> Path:
         """Return the file that ``find`` returns or, if there is none, the path where it is expected."""
-        return self.find(name, endings, moved) or self._folders[0] / posix_name(str(name))
+        return self.find(name, moved=moved) or self._folders[0] / posix_name(str(name))
 
     def image(self, name: str | PurePosixPath) -> Path:
         """Return the image named ``name``, or the path where it is expected.

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import open_binary
+from bidnerf_core.io.files import library_errors, open_binary
 
 TYPES = {
     "char": "i1",
@@ -100,7 +100,8 @@ def read_ply(path: Path, expected: str = "a PLY file") -> dict[str, np.ndarray]:
         file.seek(header.length)
         for name, element in itertools.takewhile(lambda item: not item[1].lists, header.elements.items()):
             kind = np.dtype(list(element.properties.items()))
-            try:
+            rows_expected = f"{element.count:,} rows of {len(element.properties)} numbers"
+            with library_errors(path, "is damaged", rows_expected, ValueError, TypeError, OverflowError):
                 if header.is_text:
                     rows = [file.readline().split() for _ in range(element.count)]
                     columns = np.array(rows, np.float64).reshape(element.count, len(element.properties)).T
@@ -113,10 +114,6 @@ def read_ply(path: Path, expected: str = "a PLY file") -> dict[str, np.ndarray]:
                             raise ValueError(f"{part} is not of its type")
                 elif kind.itemsize:
                     found[name] = np.frombuffer(file.read(element.count * kind.itemsize), kind)
-            except (ValueError, TypeError, OverflowError) as error:
-                raise InputError(
-                    where=path, expected=f"{element.count:,} rows of {len(element.properties)} numbers ({error})"
-                ) from error
     return found
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import read_file
+from bidnerf_core.io.files import library_errors, read_file
 
 LARGEST_ROWS = 256 * 2**20
 """Default limit on the size of a file (bytes), about that of a trajectory over a whole day at 100 Hz."""
@@ -77,10 +77,8 @@ def read_rows(path: Path, expected: str, columns: str, most: int = LARGEST_ROWS)
 
 def parse_rows(content: bytes, path: Path, expected: str, columns: str) -> list[Row]:
     """Parse rows from the content of the file ``path``, as ``read_rows`` does."""
-    try:
+    with library_errors(path, "is not text", expected, UnicodeDecodeError):
         lines = content.decode("utf-8-sig").split("\n")
-    except UnicodeDecodeError as error:
-        raise InputError(f"is not text ({error.reason})", where=path, expected=expected) from error
     rows = (Row(path, number, line.partition("#")[0].strip(), columns) for number, line in enumerate(lines, start=1))
     return [row for row in rows if row.text]
 

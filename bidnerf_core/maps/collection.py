@@ -163,9 +163,6 @@ class MapCollection:
         """The names of the maps: the given ones or folder names, with as many parent folders as needed to be unique."""
         return tuple(self._maps)
 
-    def __len__(self) -> int:
-        return len(self._maps)
-
     @property
     def cameras(self) -> tuple[Intrinsics, ...]:
         """The cameras of the images of all maps, used as candidates for photos whose camera is unknown."""
@@ -185,12 +182,12 @@ class MapCollection:
         scene = scene if isinstance(scene, Map) else load_map(scene, self._device)
         return Localizer(scene, self.method, self.config, warm_up=False)
 
-    def rank(self, frame: Frame) -> dict[str, float]:
-        """Return the share of an image's keypoints that vote for each map, most votes first; -1 where it cannot be computed."""
-        return self._rank(frame, {})
+    def rank(self, frame: Frame, detectors: dict[str, CachedFeatures] | None = None) -> dict[str, float]:
+        """Return the share of an image's keypoints that vote for each map, most votes first; -1 where it cannot be computed.
 
-    def _rank(self, frame: Frame, detectors: dict[str, CachedFeatures]) -> dict[str, float]:
-        """Return the shares of the votes, and store the detectors, which know the image's keypoints, by name."""
+        The detectors, which then know the image's keypoints, are stored in ``detectors`` by name.
+        """
+        detectors = {} if detectors is None else detectors
         found = dict.fromkeys(self._maps, -1.0)
         for features, channels, names, ballot in self._ballots if frame.has_colour else ():
             detector = detectors.setdefault(features, CachedFeatures(partial(detect, find_features(features))))
@@ -210,7 +207,7 @@ class MapCollection:
         Raises ``InputError`` for a frame that cannot be localized at all.
         """
         detectors = dict[str, CachedFeatures]()
-        ranking = self._rank(frame, detectors)
+        ranking = self.rank(frame, detectors)
         compared = [name for name, share in ranking.items() if share > -1.0]
         bare = [name for name in ranking if name not in compared]
         if compared and (most := ranking[compared[0]]) >= CERTAIN:

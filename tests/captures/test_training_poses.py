@@ -107,7 +107,7 @@ def test_too_few_images_are_left_alone() -> None:
     points = Points()
     views = ring(points, 3)
     tracked = track_views(views, points)
-    assert adjust_poses(tracked, LandmarkConfig()) is None
+    assert adjust_poses(tracked) is None
     found = training_poses(tracked, views)
     assert (found.refined, found.consistency, found.replaced) == (False, None, [])
 

@@ -71,5 +71,5 @@ def test_a_byte_in_a_text_may_be_written_as_a_float(tmp_path: Path, number: str,
     if is_byte:
         assert read_ply(path)["vertex"].tolist() == [(0.5, float(number))]
     else:
-        with refused(where=path, expected="red is not of its type"):
+        with refused(where=path, found="red is not of its type"):
             read_ply(path)
