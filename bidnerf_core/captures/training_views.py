@@ -45,7 +45,6 @@ from bidnerf_core.mapping import (
     log_evidence,
     noise,
     pinhole,
-    pose_updates,
     resections,
     track_views,
 )
@@ -271,7 +270,7 @@ def adjust_poses(
     given = tracked.T_world_camera
     seen, points = tracked.triangulate(DEFAULT_LANDMARKS)
     before = noise_of(seen, points)
-    updates = list(pose_updates(seen, points).values())
+    updates = tracked.triangulation(DEFAULT_LANDMARKS).pose_updates
     if len(updates) < ENOUGH_IMAGES:
         return None
     deviations, motion = _deviations(torch.stack(updates)), STILL

@@ -188,12 +188,12 @@ def _answers(
     try:
         # In larger maps, most landmarks are visible in none of the held-out images.
         if len(views) <= 200 or landmarks.tracks is None:
-            landmarks = tracked.without(held_out).landmarks(config)
+            landmarks = tracked.without(held_out).landmarks(config, exact_poses=True)
         else:
             seen = torch.isin(landmarks.tracks.image, torch.tensor(held_out))
             others = torch.ones(len(landmarks), dtype=torch.bool)
             others[landmarks.tracks.landmark[seen].long()] = False
-            anew = tracked.of_points_in(held_out).without(held_out).landmarks(config)
+            anew = tracked.of_points_in(held_out).without(held_out).landmarks(config, exact_poses=True)
             landmarks = concatenate([landmarks[others], anew])
     except InputError:  # the remaining images do not overlap
         return answers, updates[0]

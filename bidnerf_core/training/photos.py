@@ -128,7 +128,7 @@ def exposures(views: Sequence[View], seen: TrackedKeypoints) -> Float[Tensor, "v
     The two are estimated alternately, as medians.
     """
     image, point, count = seen.image, seen.point, len(views)
-    pixels = seen.keypoints.pixels
+    pixels = seen.pixels
     light = torch.zeros(len(image), dtype=torch.float64)  # log2 of the linear light around each keypoint
     for index in image.unique().tolist():
         own = image == index

@@ -119,16 +119,16 @@ def test_zero_and_scale_of_descriptors_are_measured(signed: bool, generator: tor
     exact = torch.randn(4000, 64, generator=generator)
     exact = exact if signed else exact.abs()
     bytes_ = quantize(exact / exact.norm(dim=-1, keepdim=True))
-    assert byte_of_zero(bytes_) == (128 if signed else 0)
+    assert byte_of_zero([bytes_]) == (128 if signed else 0)
     pairs = squared_distances(bytes_[:2000], bytes_[2000:])
     assert unrelated_distance(bytes_) == pytest.approx(float(pairs.mean().sqrt()), rel=0.01)
 
 
 def test_zero_of_bits_is_half_of_them_and_of_nothing_0(generator: torch.Generator) -> None:
     bits = 32 * torch.randint(0, 2, (500, 256), generator=generator).byte()
-    assert byte_of_zero(bits) == 16
+    assert byte_of_zero([bits]) == 16
     for few in (bits[:0], bits[:1]):
-        assert byte_of_zero(few) == 0
+        assert byte_of_zero([few]) == 0
         assert unrelated_distance(few) == 0
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from math import ceil, radians
 from typing import Annotated, TypeAlias, TypeVar
 
@@ -65,8 +65,6 @@ ENOUGH_IMAGES = 8
 Result = TypeVar("Result")
 PosedMatches: TypeAlias = dict[tuple[int, int], tuple[SE3, PairMatches]]
 """The matches of pairs of images, with the pose T_second_first of the cameras with which they were found."""
-Triangulated: TypeAlias = tuple[TrackedKeypoints, Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]
-"""The inlier keypoints, their points (metres, world), and the points' covariance for a noise of one pixel."""
 
 
 def update_scatter(updates: Sequence[Float[Tensor, "6"] | None]) -> Float[Tensor, "6 6"] | None:
@@ -149,6 +147,25 @@ def build_landmarks(
 
 
 @dataclass(frozen=True, eq=False)
+class Triangulation:
+    """The points that tracked keypoints show."""
+
+    keypoints: TrackedKeypoints  # those that fit the points
+    points: Float[Tensor, "n 3"]  # metres, world
+    covariance: Float[Tensor, "n 3 3"]  # of the points, for a noise of one pixel
+
+    @property
+    def seen(self) -> TrackedKeypoints:
+        """A copy of the keypoints without their sightings, which take much memory and last as long as the copy."""
+        return replace(self.keypoints)
+
+    @cached_property
+    def pose_updates(self) -> list[Float[Tensor, "6"]]:
+        """The updates (see ``pose_updates``) of 200 images, which show deviations to 7 %."""
+        return list(pose_updates(self.seen, self.points, 200).values())
+
+
+@dataclass(frozen=True, eq=False)
 class TrackedViews:
     """The keypoints of posed images, joined into tracks."""
 
@@ -157,7 +174,7 @@ class TrackedViews:
     # Positions (metres, world, float64) of the points by number, if they are known; otherwise they are triangulated.
     points: Float[Tensor, "p 3"] | None = None
     matches: PosedMatches = field(default_factory=dict)  # from which the tracks were joined, if they are known
-    _triangulated: dict[float, Triangulated] = field(default_factory=dict, init=False)  # by the minimum parallax
+    _triangulations: dict[float, Triangulation] = field(default_factory=dict, init=False)  # by the minimum parallax
 
     def detector_of(self, view: View, number: int) -> Features:
         """Return a detector for queries with ``view``, which is image ``number``; the detector reuses the image's keypoints."""
@@ -165,10 +182,19 @@ class TrackedViews:
         features = find_features(self.features) if isinstance(self.features, str) else self.features
         return CachedFeatures(partial(detect, features), [known])
 
-    def landmarks(self, config: LandmarkConfig, report: Callable[[str], None] = lambda sentence: None) -> LandmarkMap:
-        """Return the landmarks built from the tracks. Raises ``InputError`` if there are none."""
-        inliers = self._inliers(config) if self.points is None else _triangulate(self.observations, config, self.points)
-        landmarks = _build(self.observations, config, *inliers)
+    def landmarks(
+        self,
+        config: LandmarkConfig,
+        report: Callable[[str], None] = lambda sentence: None,
+        exact_poses: bool = False,
+    ) -> LandmarkMap:
+        """Return the landmarks built from the tracks. Raises ``InputError`` if there are none.
+
+        Unless ``exact_poses`` is set, the errors of the images' poses are estimated.
+        """
+        known = self.points is not None
+        found = _triangulate(self.observations, config, self.points) if known else self.triangulation(config)
+        landmarks = _build(self.observations, config, found, exact_poses)
         if not len(landmarks):
             images = len(self.observations.images)
             raise InputError(
@@ -186,20 +212,20 @@ class TrackedViews:
 
     def landmarks_by_image(self, config: LandmarkConfig) -> list[SeenLandmarks]:
         """Return the triangulated landmarks seen in each image; training uses their depth where none was measured."""
-        inliers, positions, covariance = self._inliers(config)
-        return landmarks_by_image(inliers, positions, noise(inliers.sightings, positions) ** 2 * covariance)
+        found = self.triangulation(config)
+        seen, points = found.seen, found.points
+        return landmarks_by_image(seen, points, noise(seen.sightings, points) ** 2 * found.covariance)
 
     def triangulate(self, config: LandmarkConfig) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"]]:
         """Return the inlier keypoints of the triangulated points, and these points (metres, world)."""
-        inliers, positions, _ = self._inliers(config)
-        return inliers, positions
+        found = self.triangulation(config)
+        return found.seen, found.points
 
-    def _inliers(self, config: LandmarkConfig) -> Triangulated:
-        """Return what ``_triangulate`` does, which is done once; without the sightings, which take much memory."""
-        if config.parallax not in self._triangulated:
-            self._triangulated[config.parallax] = _triangulate(self.observations, config)
-        inliers, positions, covariance = self._triangulated[config.parallax]
-        return replace(inliers), positions, covariance
+    def triangulation(self, config: LandmarkConfig) -> Triangulation:
+        """Return the triangulated points, which are triangulated once."""
+        if config.parallax not in self._triangulations:
+            self._triangulations[config.parallax] = _triangulate(self.observations, config)
+        return self._triangulations[config.parallax]
 
     @property
     def T_world_camera(self) -> SE3:
@@ -344,27 +370,26 @@ def detect_keypoints(views: Sequence[View], features: Features) -> list[ImageKey
 def _build(
     observations: TrackedKeypoints,
     config: LandmarkConfig,
-    inliers: TrackedKeypoints,
-    positions: Float[Tensor, "n 3"],
-    covariance: Float[Tensor, "n 3 3"],
+    triangulation: Triangulation,
+    exact_poses: bool,
 ) -> LandmarkMap:
     """Return the landmarks of triangulated points, followed by landmarks from the measured depth of the remaining keypoints."""
+    scatter = None if exact_poses else update_scatter(triangulation.pose_updates)
+    inliers, positions = triangulation.seen, triangulation.points
     pixel_noise = noise(inliers.sightings, positions)
-    triangulated = fuse_landmarks(inliers, positions, pixel_noise**2 * covariance, pixel_noise)
-    # With 200 images, the deviations are known to 7 %.
-    scatter = update_scatter(list(pose_updates(inliers, positions, 200).values()))
+    triangulated = fuse_landmarks(inliers, positions, pixel_noise**2 * triangulation.covariance, pixel_noise)
     relative = keypoint_depth_noise(inliers, positions)
     left = ~torch.isin(observations.number, inliers.number)
     rest = observations[left & (_is_tracked(observations) | config.singles)]
     rest, measured, covariance = back_project(rest, relative, pixel_noise)
     landmarks = concatenate([triangulated, fuse_landmarks(rest, measured, covariance, pixel_noise)])
-    if scatter is None and len(
-        landmarks
-    ):  # unknown: a prior assumes that each pose is as accurate as a single keypoint
+    if exact_poses or not len(landmarks):
+        return landmarks
+    if scatter is None:  # unknown: a prior assumes that each pose is as accurate as a single keypoint
         depth = torch.cat([inliers.sightings.in_camera(positions)[:, 2], rest.sightings.in_camera(measured)[:, 2]])
         angle = pixel_noise / float(torch.cat([inliers.sightings.focal, rest.sightings.focal]).median())
         scatter = MotionPrior(angle * float(depth.median()), angle).deviations.square().diag()
-    return landmarks if scatter is None else replace(landmarks, pose_covariance=scatter)
+    return replace(landmarks, pose_covariance=scatter)
 
 
 def _is_tracked(observations: TrackedKeypoints) -> Bool[Tensor, "m"]:
@@ -374,7 +399,7 @@ def _is_tracked(observations: TrackedKeypoints) -> Bool[Tensor, "m"]:
 
 def _triangulate(
     observations: TrackedKeypoints, config: LandmarkConfig, known: Float[Tensor, "p 3"] | None = None
-) -> Triangulated:
+) -> Triangulation:
     """Return the points that the tracked keypoints show, with at least the minimum parallax.
 
     If ``known`` positions are given, by number, they are used instead of triangulated ones.
@@ -395,7 +420,7 @@ def _triangulate(
         observations = observations[fits & (torch.bincount(point[fits], minlength=len(points)) >= 2)[point]]
     wide = parallax(observations.sightings, points) >= radians(config.parallax)
     observations, numbers = observations[wide[observations.point]].compact()
-    return observations, points[numbers], covariance[numbers]
+    return Triangulation(observations, points[numbers], covariance[numbers])
 
 
 def _counted(results: Generator[Result, None, None], step: Callable[[], None]) -> list[Result]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -40,19 +41,17 @@ def unrelated_distance(descriptors: UInt8[Tensor, "n d"]) -> float:
     return math.sqrt(max(0.0, 2 * (squares / count - float((total / count).square().sum()))))
 
 
-def byte_of_zero(descriptors: UInt8[Tensor, "n d"]) -> int:
+def byte_of_zero(parts: Iterable[UInt8[Tensor, "n d"]]) -> int:
     """Return the byte that represents 0 in descriptors of equal norm: 0 for SIFT, 128 for descriptors with negative channels.
 
     It is the centre of the sphere on which the descriptors lie: the byte ``z`` that minimizes the variance of the squared norms of
-    ``descriptors - z``.
+    ``descriptors - z``. The descriptors of several images, or parts of many, are added up in turn, as all would take gigabytes.
     """
-    if not len(descriptors):
-        return 0
-    # In turn, as all would take gigabytes. Sums of bytes and of their squares are exact up to 2^24.
-    values = (part.float() for part in descriptors.split(MANY))
+    values = (part.float() for part in parts)
+    # Sums of bytes and of their squares are exact up to 2^24.
     of_parts = ((part.sum(1).double(), part.square_().sum(1).double()) for part in values)
     sums, squares = map(torch.cat, zip(*of_parts, strict=True))
-    if float(sums.var(unbiased=False)) == 0:
+    if not len(sums) or float(sums.var(unbiased=False)) == 0:
         return 0
     slope = ((squares - squares.mean()) * (sums - sums.mean())).mean() / sums.var(unbiased=False)
     return round(min(255.0, max(0.0, float(slope) / 2)))
@@ -143,7 +142,7 @@ class HalfPrecisionSearch:
     """Descriptors in half precision, which represents bytes exactly; products of unit vectors are rounded by a thousandth."""
 
     def __init__(self, descriptors: UInt8[Tensor, "n d"]) -> None:
-        self._zero, self._descriptors = byte_of_zero(descriptors.cpu()), descriptors
+        self._zero, self._descriptors = byte_of_zero(descriptors.cpu().split(MANY)), descriptors
         self._half = self._unit(descriptors)
         self._squares = torch.cat([part.float().square().sum(-1) for part in self._half.split(BLOCK)])
 

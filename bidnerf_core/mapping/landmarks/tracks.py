@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 
 import numpy as np
@@ -19,7 +19,7 @@ from bidnerf_core.frames import SeenLandmarks
 from bidnerf_core.geometry import SE3, mad_deviation
 from bidnerf_core.mapping.geometry.triangulation import Sightings, sum_by, viewing_cones
 from bidnerf_core.mapping.landmarks.descriptors import MANY, byte_of_zero, mutual_nearest
-from bidnerf_core.mapping.landmarks.features import ImageKeypoints, Keypoints
+from bidnerf_core.mapping.landmarks.features import ImageKeypoints
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap, Tracks
 
 EPIPOLAR_BAND = 2.0
@@ -318,22 +318,22 @@ class TrackedKeypoints:
         rays = torch.cat([p.rays for p in self.images])[self.number]
         return Sightings(self.point, image, T.rotation.mT, T.translation, rays[:, :2], focal[image], times)
 
-    @property
-    def keypoints(self) -> Keypoints:
-        """The keypoints, in the images in which they were detected."""
+    def by_image(self, part: Callable[[ImageKeypoints], Tensor]) -> Iterator[Tensor]:
+        """Yield a part of the keypoints of each image, such as their descriptors, which take much memory together."""
         first = torch.tensor([0, *(len(image.keypoints) for image in self.images)]).cumsum(0)
         bounds = torch.searchsorted(self.number, first).tolist()
-        chosen = [
-            image.keypoints[self.number[begin:end] - start]
-            for image, start, (begin, end) in zip(self.images, first.tolist(), pairwise(bounds), strict=False)
-        ]
-        pixels, sizes, descriptors = zip(*(vars(some).values() for some in chosen), strict=True)
-        return Keypoints(torch.cat(pixels), torch.cat(sizes), torch.cat(descriptors))
+        for image, start, (begin, end) in zip(self.images, first.tolist(), pairwise(bounds), strict=False):
+            yield part(image)[self.number[begin:end] - start]
+
+    @property
+    def pixels(self) -> Float[Tensor, "m 2"]:
+        """Where the keypoints were detected in their images."""
+        return torch.cat([*self.by_image(lambda image: image.keypoints.pixels)])
 
     @property
     def depth(self) -> Float[Tensor, "m"]:
         """The depth measured at each keypoint, metres; 0 where none was measured."""
-        return torch.cat([p.depth for p in self.images])[self.number]
+        return torch.cat([*self.by_image(lambda image: image.depth)])
 
 
 def fuse_landmarks(
@@ -350,21 +350,23 @@ def fuse_landmarks(
     away = sightings.centre - positions[sightings.point]
     towards = away / torch.linalg.vector_norm(away, dim=-1, keepdim=True).clamp(min=1e-300)
     directions, cones = viewing_cones(towards, sightings.point, count)
-    keypoints, views = observations.keypoints, torch.bincount(sightings.point, minlength=count)
+    views = torch.bincount(sightings.point, minlength=count)
+    sizes = torch.cat([*observations.by_image(lambda image: image.keypoints.sizes)])
+    descriptors = partial(observations.by_image, lambda image: image.keypoints.descriptors)
     along = (directions[:, None] @ covariance @ directions[..., None])[:, 0, 0]
     across = (covariance.diagonal(dim1=-2, dim2=-1).sum(-1) - along) / 2  # the variances of both axes averaged
-    metres = keypoints.sizes * sightings.in_camera(positions)[:, 2].clamp(min=0) / sightings.focal
+    metres = sizes * sightings.in_camera(positions)[:, 2].clamp(min=0) / sightings.focal
     return LandmarkMap(
         positions.float(),
         torch.stack([across, along], dim=-1).clamp(min=0).sqrt().float(),
-        _mean_descriptors(keypoints.descriptors, sightings.point, count),
+        _mean_descriptors(descriptors, sightings.point, count),
         directions.float(),
         cones.float(),
         (sum_by(metres, sightings.point, count) / views.clamp(min=1)).float(),
         views.int(),
         noise,
         torch.zeros((6, 6), dtype=torch.float64),
-        tracks=Tracks(sightings.point.int(), sightings.view.int(), keypoints.pixels.float()),
+        tracks=Tracks(sightings.point.int(), sightings.view.int(), observations.pixels.float()),
     )
 
 
@@ -377,18 +379,25 @@ def landmarks_by_image(
     distance = torch.linalg.vector_norm(away, dim=-1)
     ray = away / distance[:, None].clamp(min=1e-300)
     variance = (ray[:, None] @ covariance[sightings.point] @ ray[..., None])[:, 0, 0]
-    parts = observations.keypoints.pixels.float(), distance.float(), variance.clamp(min=0).sqrt().float()
+    parts = observations.pixels.float(), distance.float(), variance.clamp(min=0).sqrt().float()
     return [SeenLandmarks(*(part[image == i] for part in parts)) for i in range(len(observations.images))]
 
 
-def _mean_descriptors(descriptors: UInt8[Tensor, "m d"], point: Int[Tensor, "m"], count: int) -> UInt8[Tensor, "n d"]:
-    """Return the mean descriptor of each point, rescaled to the mean norm, since a shorter descriptor is closer to all others."""
-    total, lengths = torch.zeros((count, descriptors.shape[1])), torch.zeros((count, 1))
-    zero = byte_of_zero(descriptors)
-    for rows in torch.arange(len(descriptors)).split(MANY):
-        values = descriptors[rows].float().sub_(zero)
-        total.index_add_(0, point[rows], values)
-        lengths.index_add_(0, point[rows], torch.linalg.vector_norm(values, dim=-1, keepdim=True))
+def _mean_descriptors(
+    parts: Callable[[], Iterator[UInt8[Tensor, "k d"]]], point: Int[Tensor, "m"], count: int
+) -> UInt8[Tensor, "n d"]:
+    """Return the mean descriptor of each point, rescaled to the mean norm, since a shorter descriptor is closer to all others.
+
+    ``parts`` returns the descriptors of the observations image by image, since all together take much memory.
+    """
+    zero, channels, first = byte_of_zero(parts()), next(parts()).shape[1], 0
+    total, lengths = torch.zeros((count, channels)), torch.zeros((count, 1))
+    for descriptors in parts():
+        values = descriptors.float().sub_(zero)
+        of_points = point[first : first + len(values)]
+        total.index_add_(0, of_points, values)
+        lengths.index_add_(0, of_points, torch.linalg.vector_norm(values, dim=-1, keepdim=True))
+        first += len(values)
     number = torch.bincount(point, minlength=count).clamp(min=1)[:, None]
     total /= number  # the mean; in place, as it takes much memory
     norm = torch.linalg.vector_norm(total, dim=-1, keepdim=True).clamp(min=1e-9)
