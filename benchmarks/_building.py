@@ -24,8 +24,8 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import SIFT, Keypoints, detect_keypoints
 
-ROOMS, PHOTOS = 320, 20
-"""Number of rooms, and of photos of each."""
+PHOTOS = 20
+"""Number of photos of each room."""
 SIZE, PITCH = (4.0, 3.2, 2.6), (4.4, 3.6, 3.0)
 """Size of a room, and distances between rooms, metres."""
 COLUMNS, ROWS = 10, 8

@@ -658,7 +658,7 @@ def large_answers(records: Records) -> str:
             row(f"one map of {title.removesuffix(', asked')}", found)
     for title, found in records["large"].items():
         if title.endswith(" maps"):
-            row(f"{title} of the same photos, all at once", found["together"])
+            row(f"{title} of 6,400 photos, all at once", found["together"])
             row("of these, the one that the photo shows", found["alone"])
     return _table(("map", "right", "accepted", "of these wrong", "CPU time of a query"), rows, records)
 
