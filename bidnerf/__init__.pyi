@@ -1,3 +1,8 @@
+from bidnerf import evaluation as evaluation
+from bidnerf import results as results
+from bidnerf import service as service
+from bidnerf import structure as structure
+from bidnerf import viewer as viewer
 from bidnerf.evaluation import Plan as Plan
 from bidnerf.evaluation import cluster as cluster
 from bidnerf.evaluation import compare as compare
@@ -9,6 +14,7 @@ from bidnerf.results import read_poses as read_poses
 from bidnerf.results import track as track
 from bidnerf.results import write_poses as write_poses
 from bidnerf.service import ServiceClient as ServiceClient
+from bidnerf.service import ServiceError as ServiceError
 from bidnerf.service import serve as serve
 from bidnerf.structure import find_poses as find_poses
 from bidnerf.viewer import view as view

@@ -196,14 +196,16 @@ class Answers(list[Answer | Failure]):
         )
 
     def write(self, path: str | Path) -> None:
-        """Write the poses atomically, in the format selected by the file extension.
+        """Write the poses atomically, in the format selected by the file extension, and replace an earlier file; the folder is created.
 
         A ``.json`` file lists all answers with all details. Files in other formats contain only the accepted poses; the other images are
         named with their outcomes in comments, where the format has them, and in a file beside it, see ``refused_file``. Raises
         ``UsageError`` for an unknown extension, and ``InputError`` for images that the format cannot describe.
         """
         path = Path(path)
-        if pose_format(path) == ".json":
+        ending = pose_format(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if ending == ".json":
             rows = ",\n".join(json.dumps(self.plain(answer), allow_nan=False) for answer in self)
             write_file(path, f"[\n{rows}\n]\n".encode())
             return

@@ -26,13 +26,13 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import looks_like_image
 from bidnerf_core.localization import Outcome, SceneMap, record_search
-from bidnerf_core.maps import Localizer, MapCollection, origin_of
+from bidnerf_core.maps import Localizer, MapCollection, Pixels, frame_of_pixels, origin_of
 from bidnerf_core.progress import Cancel, ProgressCallback, counter, job_context, log
 
 
 def localize(
     scene: SceneMap | Localizer | MapCollection | str | Path,
-    queries: QuerySource | str | Path | Frame | Sequence[str | Path | Frame | View | Sequence[View]],
+    queries: QuerySource | str | Path | Frame | Pixels | Sequence[str | Path | Frame | Pixels | View | Sequence[View]],
     *,
     start: Callable[[Query], SE3 | None] | None = None,
     seed: int = 0,
@@ -44,7 +44,7 @@ def localize(
     """Localize each query in a map or, among several maps, in the one that the query shows.
 
     ``scene`` is a map, its folder, a localizer with its own settings, or a collection of maps. ``queries`` are photos: files, folders, or
-    frames in memory, views or rigs of views; or a dataset, whose test images are localized; or what yields them, a ``QuerySource``.
+    frames or pixels in memory, views or rigs of views; or a dataset, whose test images are localized; or what yields them, a ``QuerySource``.
 
     A query that cannot be read or localized does not stop the others, but if it is the only query, its error is
     raised. ``start`` returns the initial T_world_camera of a query; method ``auto`` needs none, and with
@@ -103,14 +103,15 @@ def localize(
 
 def _queries(localizer: Localizer | MapCollection, given: Any) -> QuerySource:
     """Return photos, frames and a dataset as queries. Raises ``InputError`` for anything else."""
-    listed = [given] if isinstance(given, str | Path | Frame | View) or not isinstance(given, Iterable) else [*given]
+    is_one = isinstance(given, str | Path | Frame | Pixels | View) or not isinstance(given, Iterable)
+    assumed, background = (
+        (localizer.cameras, None)
+        if isinstance(localizer, MapCollection)
+        else (localizer.assumed_cameras, localizer.scene.bounds.background)
+    )
+    listed = [frame_of_pixels(each, assumed) for each in ([given] if is_one else given)]
     paths = [Path(each) for each in listed if isinstance(each, str | Path)]
     if listed and len(paths) == len(listed):
-        assumed, background = (
-            (localizer.cameras, None)
-            if isinstance(localizer, MapCollection)
-            else (localizer.assumed_cameras, localizer.scene.bounds.background)
-        )
         if len(paths) == 1 and not looks_like_image(paths[0]) and find_reader(paths[0]) is not None:
             return DatasetFrames(open_dataset(paths[0], background))
         options = DatasetOptions(CameraSource(assumed=tuple(assumed)), background=background)
@@ -122,7 +123,7 @@ def _queries(localizer: Localizer | MapCollection, given: Any) -> QuerySource:
             raise InputError(
                 f"got a {type(each).__name__}",
                 where="queries",
-                expected="photos or a dataset by path, or a Frame, View or list of Views for each",
+                expected="photos or a dataset by path, or pixels, a Frame, View or list of Views for each",
             )
         rigs.append(tuple(rig))
     return _Rigs(rigs)

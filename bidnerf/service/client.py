@@ -51,7 +51,7 @@ class ServiceClient:
     ) -> dict[str, Any]:
         """Localize a photo and return the same JSON as ``bidnerf localize``.
 
-        ``photo`` is a file, its bytes, or a uint8 array (h, w) or (h, w, 3). ``map`` names the map to search, by
+        ``photo`` is a file, its bytes, or a uint8 array (h, w) or (h, w, 3), also as an image of Pillow. ``map`` names the map to search, by
         default whichever map the photo shows. ``depth`` is a file, its bytes, or an array (h, w) of planar z: floats
         in metres or integers in millimetres, unless ``depth_unit`` is given. ``camera`` is a camera file or its
         content, and ``start`` is T_world_camera as 4x4 rows. ``known`` takes further values by keyword: ``name`` (of
@@ -61,8 +61,8 @@ class ServiceClient:
         edge = uuid.uuid4().hex
         try:
             files = {
-                "photo": _png(photo) if hasattr(photo, "shape") else photo,
-                "depth": _npy(depth) if hasattr(depth, "shape") else depth,
+                "photo": _png(photo) if _is_array(photo) else photo,
+                "depth": _npy(depth) if _is_array(depth) else depth,
                 "camera": camera,
                 "start": None if start is None else json.dumps(getattr(start, "tolist", lambda: start)()).encode(),
             }
@@ -147,6 +147,11 @@ def _part(edge: str, name: str, content: bytes, file: str | None = None) -> byte
     quoted = (file or "").replace("\\", "\\\\").replace('"', "%22").replace("\r", "").replace("\n", "")
     head = f'--{edge}\r\nContent-Disposition: form-data; name="{name}"'
     return (head + (f'; filename="{quoted}"' if file else "") + "\r\n\r\n").encode() + content + b"\r\n"
+
+
+def _is_array(given: Any) -> bool:
+    """Return whether something is an array, a tensor or an image of Pillow."""
+    return hasattr(given, "shape") or hasattr(given, "__array_interface__")
 
 
 def _npy(array: Any) -> bytes:

@@ -17,11 +17,12 @@ from threading import Event
 from typing import Any
 
 import numpy as np
+import PIL.Image
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from bidnerf_core.camera import CameraSource, Intrinsics
+from bidnerf_core.camera import CameraSource, Intrinsics, Raster
 from bidnerf_core.depth import UNKNOWN_SENSOR, DepthSensorModel, find_depth_sensor, likely_unit
 from bidnerf_core.devices import constant, set_threads_here, threads_at_most, wait_for
 from bidnerf_core.errors import InputError
@@ -50,8 +51,12 @@ from bidnerf_core.maps.scene import landmark_cameras, move_map_to, origin_of, un
 from bidnerf_core.progress import counter, current_job, job_context
 
 NO_DISTANCES = "the map's photos are from one place and show no distances"
-Start = SE3 | Float[Tensor, "4 4"] | np.ndarray | Sequence[Sequence[float]]
-"""A pose T_world_camera: an ``SE3``, or a 4x4 matrix as a tensor, an array or rows of numbers."""
+Start = SE3 | Localization | Float[Tensor, "4 4"] | np.ndarray | Sequence[Sequence[float]]
+"""A pose T_world_camera: an ``SE3``, an answer, or a 4x4 matrix as a tensor, an array or rows of numbers."""
+Pixels = np.ndarray | Tensor | PIL.Image.Image
+"""An image in memory without its camera: (h, w) or (h, w, 1 to 4), see ``Frame.from_numpy``."""
+Localizable = Frame | View | Sequence[View] | Pixels | str | Path
+"""A frame, a photo by its path or its pixels (whose camera is then assumed to be the map's), a view, or a rig of views."""
 
 
 class Localizer:
@@ -105,15 +110,15 @@ class Localizer:
 
     def __call__(
         self,
-        query: Frame | View | Sequence[View] | str | Path,
+        query: Localizable,
         start: Start | None = None,
         depth_rays: Observations | None = None,
         seed: int = 0,
     ) -> Localization:
         """Estimate T_world_camera of a frame, or of the last of several views.
 
-        ``query`` is a frame, the path of a photo (whose camera is taken from its EXIF data or the map), or views with known relative poses
-        (``T_ref_camera`` in any common frame): a rig, or a window of a sequence. ``start`` is a guess at T_world_camera of the last view,
+        ``query`` is a frame, the path of a photo (whose camera is taken from its EXIF data or the map), its pixels (whose camera is the
+        map's), or views with known relative poses (``T_ref_camera`` in any common frame): a rig, or a window of a sequence. ``start`` is a guess at T_world_camera of the last view,
         which some methods do not need. ``depth_rays`` are distances measured by another sensor, such as a lidar, in the frame of the last
         camera; methods that use colour alone reject them. Raises ``InputError`` for a query that cannot be localized at all; a doubtful
         pose is returned with an ``outcome`` other than ``CONVERGED``.
@@ -138,7 +143,7 @@ class Localizer:
 
     def many(
         self,
-        queries: Iterable[Frame | View | Sequence[View] | str | Path] | str | Path,
+        queries: Iterable[Localizable] | str | Path,
         seed: int = 0,
         workers: int | None = None,
     ) -> Iterator[Localization | InputError]:
@@ -203,7 +208,7 @@ class Localizer:
 
     def problem(
         self,
-        query: Frame | View | Sequence[View] | str | Path,
+        query: Localizable,
         start: Start | None = None,
         depth_rays: Observations | None = None,
     ) -> Problem:
@@ -214,6 +219,7 @@ class Localizer:
         T_world_camera = None if start is None else start_pose(start)
         if isinstance(query, str | Path):
             query = Frame.read(query, CameraSource(assumed=self.assumed_cameras))
+        query = frame_of_pixels(query, self.assumed_cameras)
         views = [view.over(self.scene.bounds.background) for view in _views(query)]
         problem = rig(self.scene, views, T_world_camera, depth_rays, self.matcher)
         # Landmarks alone are used, where there are some, while training is unfinished: rendering would cost much and add little.
@@ -321,8 +327,18 @@ def _views(query: Any) -> list[View]:
         raise InputError(f"{len(views)} frames without relative poses", expected="views: View(frame, T_ref_camera)")
     raise InputError(
         f"query is a {type(query).__name__}",
-        expected="the file of a photo, a Frame (Frame.from_numpy takes an array), a View, or a list of views",
+        expected="the file of a photo, its pixels as an array, a Frame, a View, or a list of views",
     )
+
+
+def frame_of_pixels(query: Any, cameras: Sequence[Intrinsics]) -> Any:
+    """Return an image in memory (``Pixels``) as a frame, whose camera is assumed to be one of ``cameras``; anything else unchanged."""
+    pixels = np.asarray(query) if isinstance(query, PIL.Image.Image) else query
+    if not isinstance(pixels, np.ndarray | Tensor) or pixels.ndim not in (2, 3):
+        return query
+    found = CameraSource(assumed=tuple(cameras)).find("image", Raster(pixels.shape[1], pixels.shape[0]))
+    about = {"camera_source": found.description, "focal_is_approximate": found.approximate}
+    return Frame.from_numpy(pixels, found.intrinsics).replace(name="", **about)
 
 
 def start_pose(start: Start, what: str = "start") -> SE3:
@@ -330,6 +346,8 @@ def start_pose(start: Start, what: str = "start") -> SE3:
 
     Raises ``InputError``, prefixed with ``what``, for anything that is not a single pose.
     """
+    if isinstance(start, Localization):
+        start = start.T_world_camera
     if isinstance(start, SE3):
         shapes = tuple(start.rotation.shape), tuple(start.translation.shape)
         if shapes != ((3, 3), (3,)):

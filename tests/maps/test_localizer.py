@@ -22,6 +22,7 @@ import bidnerf as bn
 import tiny
 from bidnerf import Cancelled, InputError, Localization, Localizer, View
 from bidnerf.testing import textured_map, training_views, unseen
+from bidnerf_core.camera import WAYS
 from bidnerf_core.geometry import SE3, perturb
 from bidnerf_core.localization import METHODS, AutoConfig, settings_of
 from bidnerf_core.progress import Progress, job_context
@@ -150,7 +151,7 @@ MIRRORED[:3, 0] *= -1
 ROW, MATRIX, POSE = "[0, 0, 0, 1]", "a 4x4 matrix T_world_camera", "an SE3 or a 4x4 matrix"
 RIGID, VIEWS = "an orthonormal rotation of determinant 1", "views: View(frame, T_ref_camera)"
 TRANSPOSE = f"{ROW}; its last column is, so the matrix is column-major: transpose it"
-QUERY = "the file of a photo, a Frame (Frame.from_numpy takes an array), a View, or a list of views"
+QUERY = "the file of a photo, its pixels as an array, a Frame, a View, or a list of views"
 FOLDER, TAKES = "a Map, or the folder of one", "method 'bid' takes a BidConfig or a dictionary"
 
 
@@ -176,8 +177,9 @@ FOLDER, TAKES = "a Map, or the folder of one", "method 'bid' takes a BidConfig o
         ([], START, "nothing to localize:", "at least one view"),
         ("image.png", START, "no such file", "an image file"),
         (Path("image.png"), START, "no such file", "an image file"),
-        (FRAME.rgb, START, "query is a Tensor", QUERY),
-        (FRAME.rgb.numpy(), START, "query is a ndarray", QUERY),
+        (FRAME.rgb[0, 0], START, "query is a Tensor", QUERY),
+        (np.zeros((2, 3, 4, 3)), START, "query is a ndarray", QUERY),
+        (FRAME.rgb, START, "no focal length in EXIF", f"a camera: {WAYS}"),
         (None, START, "query is a NoneType", QUERY),
         (["image.png"], START, "query is a list", QUERY),
     ],

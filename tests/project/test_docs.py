@@ -372,4 +372,5 @@ def test_site_builds_strictly_and_needs_no_network(
     assert "<code>fused_rays</code>" in methods
     reference = (tmp_path / "site" / "reference.html").read_text()
     described = set(re.findall(r'id="bidnerf(?:_core)?\.\w+\.(\w+)"', reference))
-    assert sorted(set(bidnerf.__all__) - described) == []
+    names = {name for name in bidnerf.__all__ if not isinstance(getattr(bidnerf, name), ModuleType)}
+    assert sorted(names - described) == []

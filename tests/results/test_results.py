@@ -12,6 +12,7 @@ from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
+import PIL.Image
 import pytest
 import torch
 from hypothesis import given, settings
@@ -252,8 +253,8 @@ def test_answers_for_a_folder_have_names_and_become_a_colmap_model(folder: Path,
     answers = bn.localize(known, folder)
     assert answers.names == [answer.name for answer in answers] == [frame.name for _, frame, _ in flight()[:FRAMES]]
     assert [each.accepted for each in answers.answers] == [number != 2 for number in range(FRAMES)]
-    answers.write(tmp_path / "images.txt")
-    model = pycolmap.Reconstruction(str(tmp_path))
+    answers.write(tmp_path / "new" / "images.txt")
+    model = pycolmap.Reconstruction(str(tmp_path / "new"))
     assert len(model.cameras) == 1
     assert model.num_reg_images() == FRAMES - 1
     distances = list[float]()
@@ -266,8 +267,8 @@ def test_answers_for_a_folder_have_names_and_become_a_colmap_model(folder: Path,
             distances.append(float(np.linalg.norm(image.project_point(point.xyz) - keypoint.xy)))
     assert np.median(distances) < 1.0
     left_out = f"{answers.names[2]}: {answers.answers[2].localization.outcome}"
-    assert f"# without a pose: {left_out}" in (tmp_path / "images.txt").read_text()
-    assert (tmp_path / "images.refused.txt").read_text().startswith(left_out)
+    assert f"# without a pose: {left_out}" in (tmp_path / "new" / "images.txt").read_text()
+    assert (tmp_path / "new" / "images.refused.txt").read_text().startswith(left_out)
     answers.write(tmp_path / "poses.hloc.txt")
     for row, image in zip(
         (tmp_path / "poses.hloc.txt").read_text().splitlines(), sorted(model.images.items()), strict=True
@@ -282,13 +283,24 @@ def test_answers_for_a_folder_have_names_and_become_a_colmap_model(folder: Path,
 def test_what_is_localized_may_be_given_in_any_form(folder: Path) -> None:
     """Files of photos, frames in memory, views and rigs; anything else is refused."""
     known, frames = scene(), [frame for _, frame, _ in flight()[:2]]
+    known = replace(known, landmarks=replace(known.landmarks, cameras=(frames[0].intrinsics,)))
     (first, second) = bn.localize(bn.Localizer(known, warm_up=False), [frames[0], bn.View(frames[1], SE3.identity())])
     assert (first.name, second.name) == (frames[0].name, frames[1].name)
     assert bn.localize(known, frames[0]).accepted[0].name == frames[0].name
     photo = next((folder / "images").rglob("*.png"))
+    with PIL.Image.open(photo) as opened:  # pixels without a camera: that of the map is assumed, as for the file
+        forms = [opened.convert("RGB"), np.asarray(opened), torch.from_numpy(np.array(opened))]
+    by_path, *by_pixels = (bn.localize(known, given)[0] for given in (photo, [forms[0]], *forms[1:]))
+    for found in by_pixels:
+        assert found.name == "0"
+        assert torch.equal(found.localization.T_world_camera.matrix(), by_path.localization.T_world_camera.matrix())
+    again = bn.Localizer(known, warm_up=False)(forms[0], start=by_path.localization)
+    assert again.converged
     assert bn.localize(known, [photo, photo.parent / "none.png"]).names == [photo.stem, "none"]
     with refused(
-        where="queries", found="got a int", expected="photos or a dataset by path, or a Frame, View or list of Views"
+        where="queries",
+        found="got a int",
+        expected="photos or a dataset by path, or pixels, a Frame, View or list of Views",
     ):
         bn.localize(known, [7])  # type: ignore[list-item]
     with refused(where="queries", found="got a int"):

@@ -32,6 +32,7 @@ from urllib.request import urlopen
 
 import imageio.v3 as iio
 import numpy as np
+import PIL.Image
 import psutil
 import pytest
 
@@ -42,8 +43,8 @@ pytest.importorskip("uvicorn", reason="the extra 'serve' is not installed")
 
 from starlette.responses import PlainTextResponse
 
-from bidnerf import InputError, ServiceClient, open_dataset, serve
-from bidnerf.service import Application, ServiceError, ServiceLimits, public_message, run_app, service_app
+from bidnerf import InputError, ServiceClient, ServiceError, open_dataset, serve
+from bidnerf.service import Application, ServiceLimits, public_message, run_app, service_app
 
 # Inside: workers are killed, and the description is compared with the parameters that are read
 from bidnerf.service.models import LocalizationBody, MapFacts, PhotoForm
@@ -584,6 +585,8 @@ def test_the_client_asks_a_server(inputs: Inputs, service: Service) -> None:
     pixels, depth = iio.imread(inputs.folder / "photo.png"), np.full((24, 24), 2.0, np.float32)
     again = client.localize(pixels, "map", focal=32, start=np.array(start), name="photo")
     assert again["T_world_camera"] == found["T_world_camera"]
+    with PIL.Image.open(inputs.folder / "photo.png") as opened:
+        assert client.localize(opened, "map", focal=32, start=start)["T_world_camera"] == found["T_world_camera"]
     assert client.localize(pixels[..., 0], "map", depth=depth, focal=32, start=start)["frame"] == "photo"
     with pytest.raises(ServiceError, match="float64"):
         client.localize(pixels / 2, "map")
