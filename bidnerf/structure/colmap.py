@@ -26,7 +26,7 @@ from bidnerf_core.camera import (
     read_exif,
     reduced_size,
 )
-from bidnerf_core.datasets import Capture, Shot
+from bidnerf_core.datasets import Capture, Shot, photo_camera
 from bidnerf_core.devices import map_tasks
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.geometry import Similarity
@@ -104,14 +104,13 @@ def list_photos(images: Capture, given: Camera | CameraSource | str | Path | Non
             listed.unusable[shot.name] = _without_file(error, file)
             continue
         exif_of_lens = replace(exif, orientation=UPRIGHT)
-        camera = numbers.setdefault((size, exif_of_lens, shot.camera), len(numbers) + 1)
+        source = photo_camera(shot.camera if given is None else given, file, shot.stem)
+        camera = numbers.setdefault((size, exif_of_lens, source), len(numbers) + 1)
         photo = ListedPhoto(shot, file, number, size, reduced_size(*size, MATCHED_SIDE), exif, camera)
         listed.photos.append(photo)
         if camera in listed.cameras:
             continue
         first: Camera = Intrinsics.from_focal(1.2 * max(size), *size)  # as COLMAP assumes
-        own = shot.camera if given is None else given
-        source = own if isinstance(own, CameraSource) else CameraSource(own)
         if source.is_given:
             first = source.find(file, Raster(*size)).camera
             listed.fixed.add(camera)

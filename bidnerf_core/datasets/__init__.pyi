@@ -22,6 +22,7 @@ from .formats.colmap import colmap_models as colmap_models
 from .formats.colmap import colmap_project as colmap_project
 from .formats.colmap import shot_of as shot_of
 from .formats.transforms_json import read_frames as read_frames
+from .frame_cameras import photo_camera as photo_camera
 from .options import AS_STORED as AS_STORED
 from .options import TEST_IMAGES as TEST_IMAGES
 from .options import DatasetOptions as DatasetOptions

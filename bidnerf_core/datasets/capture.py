@@ -28,6 +28,7 @@ from bidnerf_core.camera import (
     Raster,
     same_aspect,
 )
+from bidnerf_core.datasets.frame_cameras import photo_camera
 from bidnerf_core.depth import DepthCamera, DepthImage
 from bidnerf_core.errors import InputError, InputWarning, amount, spelling_hint
 from bidnerf_core.frames import (
@@ -129,8 +130,7 @@ class Shot:
         else:
             pixels = self.image.pixels()
             raster = Raster(pixels.shape[1], pixels.shape[0])
-        source = self.camera if isinstance(self.camera, CameraSource) else CameraSource(self.camera)
-        found = source.find(str(self.image), raster).at_most(side)
+        found = photo_camera(self.camera, self.image, self.stem).find(str(self.image), raster).at_most(side)
         camera, size = found.camera, (found.camera.width, found.camera.height)
         if isinstance(self.image, ImageSource):
             rgb, alpha = read_compact_image(self.image, background, None if size == raster.size else size)

@@ -345,6 +345,24 @@ def test_the_camera_of_a_photo_is_chosen_by_its_name(tmp_path: Path) -> None:
     assert [queries.read(place).frame.intrinsics.fx for place in range(2)] == [50, 60]
 
 
+def test_a_dataset_whose_frames_state_cameras_is_a_file_of_cameras(tmp_path: Path) -> None:
+    """Each photo has the camera of the frame of its name, or else the only one."""
+    for name in ("a", "b", "c"):
+        write_photo(tmp_path / f"{name}.png", noise(48, 64))
+    options, frames = DatasetOptions(tmp_path / "transforms_test.json"), list[dict[str, Any]]()
+    photos = Photos([tmp_path / "a.png", tmp_path / "b.png", tmp_path / "c.png"], options)
+    for focal, found in ((50.0, [50, 50, 50]), (60.0, [50, 60, None])):
+        image = f"images\\test\\{'ab'[len(frames)]}.png"
+        frames.append({"file_path": image, "fl_x": focal, "w": 64, "h": 48, "transform_matrix": np.eye(4).tolist()})
+        (tmp_path / "transforms_test.json").write_text(json.dumps({"frames": frames}))
+        for place, fx in enumerate(found):
+            if fx is not None:
+                assert photos.read(place).frame.intrinsics.fx == fx
+                continue
+            with refused(where=options.camera, found="holds 2 cameras", expected="one, or one of a frame named 'c'"):
+                photos.read(place)
+
+
 @pytest.mark.parametrize(
     ("content", "found", "expected"),
     [

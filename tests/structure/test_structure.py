@@ -469,6 +469,17 @@ def test_photos_of_one_lens_share_a_camera_however_they_are_turned(tmp_path: Pat
     assert [photo.camera for photo in found.photos] == [1, 1, 2, 3]
     assert (found.known_focal, found.fixed) == ({1, 2}, set())
     assert found.cameras[2].pinhole.fx == pytest.approx(2 * found.cameras[1].pinhole.fx)
+    frames = [
+        {"file_path": f"{n}.png", "fl_x": f, "w": CAMERA.width, "h": CAMERA.height}
+        for n, f in (("a", 300), ("b", 300), ("c", 310))
+    ]
+    (tmp_path / "transforms_train.json").write_text(
+        json.dumps({"frames": frames})
+    )  # a dataset that states a camera for each
+    given = list_photos(
+        Capture(tmp_path, [Shot(image=file) for file in files[:3:2]]), tmp_path / "transforms_train.json"
+    )
+    assert ([camera.pinhole.fx for camera in given.cameras.values()], given.fixed) == ([300, 310], {1, 2})
 
 
 @given(

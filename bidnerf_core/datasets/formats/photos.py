@@ -14,8 +14,9 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from bidnerf_core.camera import WAYS, CameraSource
+from bidnerf_core.camera import WAYS
 from bidnerf_core.datasets.capture import Capture, Colour, Shot
+from bidnerf_core.datasets.frame_cameras import photo_camera
 from bidnerf_core.datasets.reader import DatasetOptions, Format
 from bidnerf_core.datasets.video import VIDEO_SUFFIXES, Video, VideoPicture, is_video
 from bidnerf_core.depth import MILLIMETRE, DepthCamera
@@ -40,7 +41,7 @@ class PhotoShot(Shot):
         """Read the photo as ``Frame.read`` does."""
         return Frame.read(
             self.image,
-            self.camera if isinstance(self.camera, CameraSource) else CameraSource(self.camera),
+            photo_camera(self.camera, self.image, self.stem),
             depth=self.depth_image,
             depth_unit=self.depth_unit,
             sensor=self.sensor,
