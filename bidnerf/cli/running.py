@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 
@@ -22,22 +23,32 @@ from bidnerf.cli.signals import Interrupted, installed_handler
 from bidnerf_core.errors import Cancelled
 from bidnerf_core.progress import Progress, duration_text, job_context
 
+SILENCE = 60.0
+"""Seconds without a line after which a stage says that it goes on, if stderr is not a terminal."""
+
 
 class Display:
     """Displays the progress that it is called with: as a bar for each stage on a terminal, else as occasional lines.
 
     A stage begins when its name first appears, or when it is reported with nothing done. A stage with a single unit
-    shows only the elapsed time, or nothing if stderr is not a terminal.
+    shows only the elapsed time. If stderr is not a terminal, ``remind`` says after a silent minute that the stage goes on.
     """
 
     def __init__(self) -> None:
-        self._stage, self._first = "", 0
+        self._stage, self._first, self._counted = "", 0, "working"
         self._began = self._spoke = time.monotonic()
         self.bar: Bar | None = None
+
+    def remind(self) -> None:
+        """Print how long the stage has taken, unless there is a bar or a line was printed in the last minute."""
+        if self.bar is None and time.monotonic() - self._spoke >= SILENCE:
+            self._spoke = time.monotonic()
+            say(f"{self._counted}, {duration_text(self._spoke - self._began)} so far")
 
     def __call__(self, now: Progress) -> None:
         if now.stage != self._stage or not now.done:
             self._begin(now)
+        self._counted = f"{Progress(now.stage, now.done, now.total, now.unit)}" if now.total > 1 else now.stage
         elapsed = time.monotonic() - self._began
         each = elapsed / max(1, now.done - self._first)
         rate = f"{each:.1f} s each" if each >= 1 else f"{1 / each:.1f} per second" if each > 1e-6 else ""
@@ -87,11 +98,18 @@ def report_time(what: str) -> Iterator[None]:
 @contextlib.contextmanager
 def display_progress() -> Iterator[None]:
     """Display the progress of the work in the context."""
-    display = Display()
+    display, ended = Display(), threading.Event()
+
+    def remind() -> None:
+        while not ended.wait(SILENCE / 6):
+            display.remind()
+
+    threading.Thread(target=remind, daemon=True).start()
     try:
         with job_context(display):
             yield
     finally:
+        ended.set()
         if display.bar is not None:
             display.bar.stop()
 

@@ -26,13 +26,18 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.geometry import SE3
 from bidnerf_core.io import looks_like_image
 from bidnerf_core.localization import Outcome, SceneMap, record_search
-from bidnerf_core.maps import Localizer, MapCollection, Pixels, frame_of_pixels, origin_of
+from bidnerf_core.maps import Localizer, MapCollection, PixelArray, frame_of_pixels, origin_of
 from bidnerf_core.progress import Cancel, ProgressCallback, counter, job_context, log
 
 
 def localize(
     scene: SceneMap | Localizer | MapCollection | str | Path,
-    queries: QuerySource | str | Path | Frame | Pixels | Sequence[str | Path | Frame | Pixels | View | Sequence[View]],
+    queries: QuerySource
+    | str
+    | Path
+    | Frame
+    | PixelArray
+    | Sequence[str | Path | Frame | PixelArray | View | Sequence[View]],
     *,
     start: Callable[[Query], SE3 | None] | None = None,
     seed: int = 0,
@@ -60,6 +65,7 @@ def localize(
         answers = Answers(localizer if isinstance(localizer, MapCollection) else localizer.scene)
     with job_context(progress, cancel):
         count, total = counter("localizing", "images"), len(queries.names)
+        count(0, total)
         for number, name in enumerate(queries.names):
             answer: Answer | Failure
             query, placement, matches = Query(name, ()), None, None
@@ -103,7 +109,7 @@ def localize(
 
 def _queries(localizer: Localizer | MapCollection, given: Any) -> QuerySource:
     """Return photos, frames and a dataset as queries. Raises ``InputError`` for anything else."""
-    is_one = isinstance(given, str | Path | Frame | Pixels | View) or not isinstance(given, Iterable)
+    is_one = isinstance(given, str | Path | Frame | PixelArray | View) or not isinstance(given, Iterable)
     assumed, background = (
         (localizer.cameras, None)
         if isinstance(localizer, MapCollection)

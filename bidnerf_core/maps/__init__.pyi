@@ -22,7 +22,7 @@ from .known_lengths import ScaleFit as ScaleFit
 from .known_lengths import factor_of_distance as factor_of_distance
 from .known_lengths import factor_of_poses as factor_of_poses
 from .localizer import Localizer as Localizer
-from .localizer import Pixels as Pixels
+from .localizer import PixelArray as PixelArray
 from .localizer import Start as Start
 from .localizer import frame_of_pixels as frame_of_pixels
 from .localizer import picture_at as picture_at

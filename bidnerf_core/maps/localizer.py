@@ -53,9 +53,9 @@ from bidnerf_core.progress import counter, current_job, job_context
 NO_DISTANCES = "the map's photos are from one place and show no distances"
 Start = SE3 | Localization | Float[Tensor, "4 4"] | np.ndarray | Sequence[Sequence[float]]
 """A pose T_world_camera: an ``SE3``, an answer, or a 4x4 matrix as a tensor, an array or rows of numbers."""
-Pixels = np.ndarray | Tensor | PIL.Image.Image
+PixelArray = np.ndarray | Tensor | PIL.Image.Image
 """An image in memory without its camera: (h, w) or (h, w, 1 to 4), see ``Frame.from_numpy``."""
-Localizable = Frame | View | Sequence[View] | Pixels | str | Path
+Localizable = Frame | View | Sequence[View] | PixelArray | str | Path
 """A frame, a photo by its path or its pixels (whose camera is then assumed to be the map's), a view, or a rig of views."""
 
 
@@ -332,7 +332,7 @@ def _views(query: Any) -> list[View]:
 
 
 def frame_of_pixels(query: Any, cameras: Sequence[Intrinsics]) -> Any:
-    """Return an image in memory (``Pixels``) as a frame, whose camera is assumed to be one of ``cameras``; anything else unchanged."""
+    """Return an image in memory (``PixelArray``) as a frame, whose camera is assumed to be one of ``cameras``; anything else unchanged."""
     pixels = np.asarray(query) if isinstance(query, PIL.Image.Image) else query
     if not isinstance(pixels, np.ndarray | Tensor) or pixels.ndim not in (2, 3):
         return query

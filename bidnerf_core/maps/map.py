@@ -353,7 +353,7 @@ class Map:
         at those of the views. Raises ``InputError`` if there are no cameras at all, and if the images do not agree on
         a surface.
         """
-        check_cancelled("surface")
+        counter("baking the surface", "stage")(0, 1)
         started = time.monotonic()
         cameras = cameras_of(self.info) or [(view.frame.intrinsics, view.T_ref_camera) for view in views]
         if scan is not None:

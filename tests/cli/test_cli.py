@@ -36,9 +36,11 @@ from bidnerf_core.datasets import open_dataset
 from bidnerf_core.geometry import SE3
 from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.maps import Checkpoints, Localizer, MapInfo, check_resumable, load_info, load_map
+from bidnerf_core.progress import counter
 from bidnerf_core.training import TrainingStep
 from commands import Run, assert_refused, quietly, strict
 from trainings import assert_same_map, stop_at
+from waiting import wait_until
 
 QUICK = ["--method", "bid", "--perturb", "0.1", "5", "--max-steps", "3", "--rays", "64"]
 Edit = Callable[[Path], Any]
@@ -79,6 +81,16 @@ def test_a_line_of_progress_leaves_out_what_the_recipe_does_not_tell(
         Checkpoints(info).step(TrainingStep(5, 5, 0.25, 6.0, samples))
     line = f"training: 5/5 steps, loss 0.25000  PSNR 6.00 dB{shown}, 0 s left\n"
     assert capsys.readouterr().err == line
+
+
+@pytest.mark.parametrize(("total", "shown"), [(1, "localizing"), (3, "localizing: 1/3 images")])
+def test_a_stage_that_is_silent_says_that_it_goes_on(
+    total: int, shown: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bidnerf.cli.running.SILENCE", 0.05)
+    with display_progress():
+        counter("localizing", "images")(total // 2, total)
+        wait_until(lambda: f"{shown}, 0 s so far\n" in capsys.readouterr().err, 20)
 
 
 # Datasets that cannot be used.
