@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 from bidnerf_core.errors import Cancelled, InputError
+
+Item = TypeVar("Item")
 
 log = logging.getLogger("bidnerf")
 """The logger of the remarks that users see."""
@@ -90,6 +92,14 @@ def check_cancelled(stage: str = "localization") -> None:
 def counter(stage: str, unit: str) -> Callable[[int, int], None]:
     """Return a function of (done, total) that reports to the current job, and raises ``Cancelled`` if the job should stop."""
     return lambda done, total: report_progress(Progress(stage, done, total, unit))
+
+
+def report_each(items: Collection[Item], stage: str, unit: str) -> Iterator[Item]:
+    """Yield the items, and after each report how many are done to the current job; raises ``Cancelled`` if the job should stop."""
+    check_cancelled(stage)
+    for number, item in enumerate(items, start=1):
+        yield item
+        report_progress(Progress(stage, number, len(items), unit))
 
 
 def report_progress(progress: Progress) -> None:

@@ -35,7 +35,7 @@ from bidnerf.cli.output import check_folder, check_output, print_result, say
 from bidnerf.cli.parameters import Flag, Group, Option, SettingsGroup, Without
 from bidnerf.cli.running import display_progress, interruptible_work
 from bidnerf_core.errors import InputError, UsageError, amount
-from bidnerf_core.progress import counter
+from bidnerf_core.progress import report_each
 from bidnerf_core.settings import EXPERT, Above, WholeNumbers
 
 if TYPE_CHECKING:
@@ -216,14 +216,13 @@ def _render_views(scene: Map, level: int | None, views: Sequence[View], out: Pat
     from bidnerf_core.geometry import symbol
     from bidnerf_core.maps import RenderingScores, rendering_scores
 
-    scores, count = [], counter("rendering", "images")
-    for number, view in enumerate(views):
+    scores = []
+    for view in report_each(views, "rendering", "images"):
         image = scene.render(view, level)
         write_images(out, view.frame.name, image)
         scores.append(rendering_scores(image, view.frame, scene.unit))
         row = {"frame": view.frame.name, "psnr": scores[-1].psnr, "depth_error": scores[-1].depth_error}
         print_result(row, [f"{view.frame.name}  {scores[-1]}"], json)
-        count(number + 1, len(views))
     errors = torch.cat([score.depth_errors for score in scores])
     mean = RenderingScores(statistics.fmean(score.psnr for score in scores), errors, scene.unit)
     error = "-" if mean.depth_error is None else f"{mean.depth_error:.4f}"

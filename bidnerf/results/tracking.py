@@ -12,7 +12,7 @@ from bidnerf_core.errors import InputError, InputWarning, amount
 from bidnerf_core.frames import Frame
 from bidnerf_core.localization import SceneMap
 from bidnerf_core.maps import Localizer, Tracker, TrackerConfig, landmark_cameras
-from bidnerf_core.progress import Cancel, ProgressCallback, counter, job_context, log
+from bidnerf_core.progress import Cancel, ProgressCallback, job_context, log, report_each
 
 
 def track(
@@ -47,17 +47,16 @@ def track(
         sequence = open_sequence(sequence, assumed=landmark_cameras(stored), background=stored.bounds.background)
     if answers is None:
         answers = Answers(tracker.localizer.scene, is_sequence=True, interval=TrackerConfig().frame_seconds)
-    total, sources, lost_at = -(-len(sequence) // every), set[str](), None
+    indices, sources, lost_at = range(0, len(sequence), every), set[str](), None
     with job_context(progress, cancel):
-        count = counter("tracking", "frames")
-        for number, index in enumerate(range(0, len(sequence), every)):
+        for number, index in enumerate(report_each(indices, "tracking", "frames")):
             try:
                 timed = sequence[index]
             except BreaksOff:
                 raise
             except InputError as error:
                 # If none of the first three frames can be read, probably none can.
-                if not answers.answers and number + 1 >= min(3, total):
+                if not answers.answers and number + 1 >= min(3, len(indices)):
                     many = "the first frame cannot" if number == 0 else f"none of the first {number + 1} frames can"
                     raise InputError(f"{many} be read: {error}") from error
                 warnings.warn(f"{error}; left out", InputWarning, stacklevel=2)
@@ -79,5 +78,4 @@ def track(
                     lost_at = None
                 if each is not None:
                     each(timed.frame, answer)
-            count(number + 1, total)
     return answers

@@ -28,7 +28,7 @@ from bidnerf_core.maps.localizer import Localizer
 from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.maps.scene import origin_of, unit_of
 from bidnerf_core.maps.store import read_part
-from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context, log
+from bidnerf_core.progress import Cancel, ProgressCallback, job_context, log, report_each
 
 _Scene = TypeVar("_Scene", bound=Map | str | Path)
 
@@ -140,13 +140,10 @@ class MapCollection:
         }
         landmarks: dict[str, LandmarkMap] = {}
         with job_context(progress, cancel):
-            count = counter("reading", "maps")
-            for number, (name, scene) in enumerate(self._maps.items(), start=1):
-                check_cancelled("reading maps")
+            for name, scene in report_each(self._maps.items(), "reading", "maps"):
                 found = scene.landmarks if isinstance(scene, Map) else read_part(scene, self._infos[name], "landmarks")
                 if found is not None and len(found):
                     landmarks[name] = found.to("cpu")
-                count(number, len(self._maps))
         # The maps with landmarks by the detector and the length of their descriptors, and an index of each such group.
         groups = dict[tuple[str, int], list[str]]()
         for name, found in landmarks.items():

@@ -47,7 +47,7 @@ from bidnerf_core.maps.scene import landmark_cameras
 from bidnerf_core.maps.store import with_tracks_in
 from bidnerf_core.maps.training import TrainOptions, train_field
 from bidnerf_core.maps.views import ViewSource, scaled_view, views_again
-from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, counter, job_context, log
+from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled, job_context, log, report_each
 
 NewPhotos: TypeAlias = Sequence[Frame] | Sequence[View] | Capture | str | Path
 """Photos to add: frames, views, a dataset or the path to one, or the path to a photo or a folder of photos.
@@ -117,10 +117,9 @@ def localize_new(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOutPh
     localizer, cameras = Localizer(scene), {camera.name: camera.pose for camera in scene.info.cameras}
     # A photo with the name of one of the map's photos counts as that photo if it was taken within this
     # distance of it.
-    near, count = 0.02 * scene.bounds.side, counter("locating", "photos")
+    near = 0.02 * scene.bounds.side
     views, left_out, known, outcomes = list[View](), list(unread), 0, list[Outcome]()
-    for number, frame in enumerate(frames, start=1):
-        check_cancelled("extending")
+    for frame in report_each(frames, "locating", "photos"):
         try:
             found = localizer.solve(localizer.problem(frame))
         except InputError as error:
@@ -137,7 +136,6 @@ def localize_new(scene: Map, frames: Sequence[Frame], unread: Sequence[LeftOutPh
                 like = _names_like(frame.name, {*cameras, *(view.frame.name for view in views)})
                 name = f"{frame.name}_{len(like) + 1}" if like else frame.name
                 views.append(View(found.frame_as_taken(frame).replace(name=name), found.T_world_camera))
-        count(number, len(frames))
     for name, why in left_out:
         log.info(f"{name}: left out: {why}")
     # If fewer photos than this are localized, they do not show the scene of the map.
@@ -194,8 +192,8 @@ def _old_views(scene: Map, data: ViewSource | None, split: str) -> list[View]:
                 "data has none of the images that the map was built from", where=scene.name, expected="these"
             )
         return views
-    count, views = counter("rendering", "images"), []
-    for number, camera in enumerate(scene.info.cameras, start=1):
+    views = []
+    for number, camera in enumerate(report_each(scene.info.cameras, "rendering", "images"), start=1):
         small, pose = camera.intrinsics.at_most(320), camera.pose
         image = render_image(scene.field, small, pose, scene.bounds)
         # Training preserves some of the distances that the field renders, without treating them as measurements.
@@ -206,7 +204,6 @@ def _old_views(scene: Map, data: ViewSource | None, split: str) -> list[View]:
         distance = depth[rows[:, 0], rows[:, 1]].double() * small.unproject(pixels).norm(dim=-1)
         seen = SeenLandmarks(pixels.float(), distance.float(), (0.01 * distance).float())
         views.append(View(Frame(camera.name, image.rgb.cpu().clamp(0, 1), small), pose, landmarks=seen))
-        count(number, len(scene.info.cameras))
     return views
 
 

@@ -38,7 +38,7 @@ from bidnerf_core.frames import (
 from bidnerf_core.geometry import SE3, LengthUnit
 from bidnerf_core.io import available_memory, background_colour
 from bidnerf_core.maps.description import MapInfo
-from bidnerf_core.progress import counter, log
+from bidnerf_core.progress import log, report_each
 
 ViewSource: TypeAlias = Capture | Sequence[View] | str | Path
 """Images with poses: a dataset, the path to one, or views whose reference frame is the world."""
@@ -160,10 +160,10 @@ def _read_dataset(data: Capture, split: str, largest: int | None, folder: Path |
     where, shots = str(data.path), data.select(split)
     if not shots:
         raise InputError(f"split {split!r} has no frames", where=where)
-    count, views = counter("reading", "images"), list[View]()
+    views = list[View]()
     whole = data if largest is None else data.at_most(sys.maxsize)  # the first image's own size is logged
     store, limit = PixelStore(0), 0
-    for number, shot in enumerate(shots, start=1):
+    for shot in report_each(shots, "reading", "images"):
         try:
             view = whole.view(shot, limit or None)
         except WhollyHidden:  # by a mask
@@ -181,7 +181,6 @@ def _read_dataset(data: Capture, split: str, largest: int | None, folder: Path |
                         f" {len(shots) * bytes_of(small) / 1e6:.0f} MB; `largest` sets another size"
                     )
             views.append(replace(view, frame=store.store(view.frame.at_most(limit))))
-        count(number, len(shots))
     if left_out := len(shots) - len(views):
         log.info(f"{where}: {amount(left_out, 'image')} left out, being entirely hidden; {INVERTED}")
     if not views:
