@@ -99,10 +99,6 @@ def test_a_process_elsewhere_finds_what_this_one_finds(
         assert timeless([again]) == timeless([found])
 
 
-def test_a_process_elsewhere_takes_no_file_of_the_folder_for_a_module(compared: Comparison) -> None:
-    assert [r.steps for column in compared.results for r in column] == [3] * 4
-
-
 def test_a_row_says_what_the_map_costs(compared: Comparison, maps: list[Path]) -> None:
     assert [r.map for r in compared.rows] == ["short", "long"]
     for found, folder in zip(compared.rows, maps, strict=True):

@@ -24,7 +24,6 @@ import bidnerf as bn
 import tiny
 from bidnerf.cli import main
 from bidnerf.evaluation import (
-    Comparison,
     Plan,
     ResultTable,
     Trial,
@@ -43,7 +42,6 @@ from bidnerf.results import pose_error
 from bidnerf.scenes import closed_form_data, closed_form_map
 from bidnerf_core.datasets import DatasetOptions, open_dataset
 from bidnerf_core.geometry import SE3
-from bidnerf_core.io import from_plain
 from bidnerf_core.localization import find_method
 from bidnerf_core.progress import Progress
 from bidnerf_core.registry import registered
@@ -101,7 +99,7 @@ def test_a_table_has_what_the_command_writes(shared: Path, tmp_path: Path, capsy
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_table_is_summed_up_saved_and_loaded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_table_is_summed_up_as_its_report_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = bn.evaluate(BLOBS, BLOBS, quick(trials=4))
     (group,) = table.groups
     found = require(group.summary.success["5deg 0.05"])
@@ -110,8 +108,6 @@ def test_a_table_is_summed_up_saved_and_loaded(tmp_path: Path, capsys: pytest.Ca
     assert "5deg 0.05" in str(table)
     assert "bid 0.3" in str(table)
     table.save(tmp_path / "r.jsonl")
-    again = ResultTable.load(tmp_path / "r.jsonl")
-    assert (again, str(again)) == (table, str(table))
     assert main(["report", str(tmp_path / "r.jsonl"), "--out", str(tmp_path / "report")]) == 0
     assert str(table) in capsys.readouterr().out
 
@@ -328,7 +324,7 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
 
 
 @pytest.mark.usefixtures("no_processes")
-def test_maps_in_memory_and_in_folders_are_compared(shared: Path, tmp_path: Path) -> None:
+def test_maps_in_memory_and_in_folders_are_compared(shared: Path) -> None:
     plan = quick(trials=2)
     scene, data = bn.load_map(shared / "map"), shared / "data"
     seen: list[str] = []
@@ -342,8 +338,6 @@ def test_maps_in_memory_and_in_folders_are_compared(shared: Path, tmp_path: Path
     named = bn.compare({"mine": scene}, open_dataset(data), plan)
     assert [row.map for row in named.rows] == ["mine"]
     assert "mine" in str(named)
-    named.save(tmp_path / "c.json")
-    assert from_plain(Comparison, json.loads((tmp_path / "c.json").read_text()), "c") == named
     with pytest.raises(bn.Cancelled):
         bn.compare([scene], data, plan, cancel=lambda: True)
 
