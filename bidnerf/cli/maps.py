@@ -160,6 +160,13 @@ def run_scale(
         elif distance is not None:
             factor = factor_of_distance(scene, first, second, metres)
         assert factor is not None
+        by_its_data = scene.info.unit == "metres" and scene.info.field_frame is None
+        if by_its_data and factor != 1 and out is None and not overwrite:
+            raise InputError(
+                f"is in metres by its data, and all its lengths would be multiplied by {factor:.6g}; write another map (`out`),"
+                " or replace this one all the same (`overwrite`)",
+                where=map,
+            )
         stored = scene.scaled(factor).write_to(out or map)
     sides = " x ".join(f"{side:.3g}" for side in stored.bounds.size)
     text = f"{out or map}: all lengths multiplied by {factor:.6g}; the scene is now in metres, in a box of {sides}"

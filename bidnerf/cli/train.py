@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 from bidnerf.cli.options import (
     CameraOptions,
     DaskAddress,
+    First,
     ImageOptions,
     Json,
     MapOutput,
@@ -110,6 +111,7 @@ class TrainingOptions:
     backend: Annotated[
         str | None, installed("backends"), Option("NAME", "kind of field, one of 'bidnerf backends'", USUAL_BACKEND)
     ] = None
+    first: First = None
     quick: Annotated[Flag, Option(None, "train briefly, with the backend's settings for a first map")] = False
     resume: Annotated[Flag, Option(None, "continue the interrupted training in --out")] = False
     finish: Annotated[Flag, Option(None, "end the interrupted training in --out now, with the steps done so far")] = (
@@ -197,7 +199,15 @@ def run_train(
 
     from bidnerf_core.datasets import lacks_poses
     from bidnerf_core.io import background_colour
-    from bidnerf_core.maps import DESCRIPTION, OtherSettings, TrainOptions, resume, train
+    from bidnerf_core.maps import (
+        DESCRIPTION,
+        MATCHES,
+        MATCHES_STAY,
+        OtherSettings,
+        TrainOptions,
+        resume,
+        train,
+    )
 
     if images.background is not None:
         with wrong_usage():
@@ -224,10 +234,13 @@ def run_train(
         given_poses.poser,
         sparse_depth.depth_points,
         sparse_depth.model_points(),
+        training.first,
         training.checkpoint_every,
     )
 
     def saved() -> str:
+        if not (out / DESCRIPTION).exists() and any(out.glob(MATCHES)):
+            return f"{out}: stopped; {MATCHES_STAY}"
         if not (out / DESCRIPTION).exists():
             return f"{out}: stopped before anything of the map was saved; the same command starts again"
         return (

@@ -23,9 +23,9 @@ from bidnerf.cli.options import (
 from bidnerf.cli.output import check_output, console, say, show
 from bidnerf.cli.parameters import Group, Option, Without
 from bidnerf.cli.running import display_progress
-from bidnerf.service import LEAST_TOKEN, ServiceLimits
+from bidnerf.service import LEAST_TOKEN, ServiceLimits, check_token
 from bidnerf.service import serve as serve_maps
-from bidnerf_core.errors import InputError, UsageError
+from bidnerf_core.errors import UsageError, errors_in
 from bidnerf_core.installation import import_extra
 from bidnerf_core.io import read_file
 from bidnerf_core.registry import USUAL_METHOD
@@ -167,9 +167,9 @@ def run_serve(
     require_device(device)
     stated = os.environ.get(TOKEN)
     if token_file is not None:
-        stated = read_file(token_file, "a file with a token", 4096).decode(errors="replace").strip()  # checked later
-        if not stated:
-            raise InputError("is empty", where=token_file, expected="a token")
+        stated = read_file(token_file, "a file with a token", 4096).decode(errors="replace").strip()
+        with errors_in(token_file):
+            check_token(stated)
 
     def announce(address: str, token: str | None) -> None:
         """Print the address of the service and, if it was generated, the token; a token that the user gave must not be logged."""

@@ -262,9 +262,12 @@ def read_positions(path: str | Path) -> dict[str, Float[Tensor, "3"]]:
 
 def _numbers(where: str, values: Any, expected: str) -> Tensor:
     try:
-        return torch.tensor(values, dtype=torch.float64)
+        numbers = torch.tensor(values, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise InputError("contains no matrix of numbers", where=where, expected=expected) from error
+    if not bool(numbers.isfinite().all()):
+        raise InputError("holds numbers that are NaN or infinite", where=where, expected=expected)
+    return numbers
 
 
 def pose_of(poses: dict[str, SE3], name: str, path: str | Path) -> SE3:

@@ -16,6 +16,7 @@ from .server import serve as serve
 from .server import service_app as service_app
 from .settings import LEAST_TOKEN as LEAST_TOKEN
 from .settings import ServiceLimits as ServiceLimits
+from .settings import check_token as check_token
 from .upload import public_message as public_message
 from .upload import read_upload as read_upload
 from .web import OPEN as OPEN

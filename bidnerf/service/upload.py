@@ -29,7 +29,11 @@ def read_upload(upload: Upload, usual: CameraSource, folder: Path, max_pixels: f
         file.write_bytes(content)
         if ending == ".npy":  # an array is as large as its file, which reading it checks
             continue
-        header = read_header(file)
+        try:
+            header = read_header(file)
+        except InputError as error:  # perhaps the name of a file instead of its content
+            expected = f"an image file, as 'curl -F {name}=@FILE' sends it" if content.isascii() else None
+            raise InputError(error, expected=expected) from error
         widths[name] = header.width
         if header.width * header.height > max_pixels:
             raise InputError(

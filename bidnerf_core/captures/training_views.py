@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -81,21 +81,25 @@ def prepare_views(
     features: str = USUAL_FEATURES,
     trust_poses: bool = False,
     depth_unit: float | None = None,
+    labels: Int[Tensor, "m"] | None = None,
+    tracks: Callable[[TrackedViews], None] = lambda tracked: None,
 ) -> TrainingViews:
     """Refine the poses of the views if requested, and find the landmarks visible in the views.
 
     ``features`` is the name of the keypoint detector. ``depth_unit`` is the unit with which depth images were read
-    (metres per step), or None if the user cannot set another. Raises ``InputError`` if the poses contradict most
+    (metres per step), or None if the user cannot set another. ``tracks`` receives the tracks once the keypoints are matched, which takes
+    longest; their ``labels`` from an earlier call with the same views spare it. Raises ``InputError`` if the poses contradict most
     pairs of images, unless ``trust_poses`` is set, and if measured depth is clearly in a different unit from the poses.
     """
     if refinement == "never":
-        tracked, seeing = track_landmarks(views, features, trust_poses, depth_unit)
+        tracked, seeing = track_landmarks(views, features, trust_poses, depth_unit, labels)
         if tracked is None and not trust_poses:
             # Up to twelve evenly spread runs of five consecutive views suffice to check the poses.
             every = 5 * max(1, math.ceil(len(views) / 60))
             _check_poses(detect_keypoints([view for number, view in enumerate(views) if number % every < 5], SIFT))
         return TrainingViews(seeing, tracked, stored_cameras(views), distances=shows_distances(views, tracked))
-    tracked = _track(views, features, trust_poses, depth_unit)
+    tracked = _track(views, features, trust_poses, depth_unit, labels)
+    tracks(tracked)
     fit = training_poses(tracked, views, 0.0 if refinement == "always" else INCONSISTENT)
     poses, motion = fit.tracked.T_world_camera, fit.tracked.observations.motion
     moved = list(views)

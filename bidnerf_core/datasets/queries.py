@@ -13,6 +13,7 @@ from bidnerf_core.datasets.capture import Capture
 from bidnerf_core.datasets.formats.photos import PhotoShot
 from bidnerf_core.datasets.options import AS_STORED
 from bidnerf_core.datasets.reader import DatasetOptions, file_of_dataset, no_dataset
+from bidnerf_core.datasets.video import VIDEO_SUFFIXES
 from bidnerf_core.errors import InputError, InputWarning, UsageError, amount, enumeration
 from bidnerf_core.frames import DEPTH_STEM, Frame, View, photos_in
 from bidnerf_core.geometry import SE3
@@ -174,6 +175,8 @@ def photo_files(paths: Sequence[Path], depth: Sequence[Path] = ()) -> list[Path]
         if not path.is_dir():
             if (instead := file_of_dataset(path)) is not None and not looks_like_image(path):
                 raise InputError(instead, where=path)
+            if path.suffix.lower() in VIDEO_SUFFIXES:
+                raise InputError("is a video", where=path, expected="photos; 'bidnerf track' takes videos")
             files.append(path)
             continue
         found, others = photos_in(path)

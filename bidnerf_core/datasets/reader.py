@@ -335,6 +335,8 @@ def no_dataset(path: Path, readers: Sequence[Reader] | None = None, or_else: str
             where=path,
             expected="'bidnerf import' with its point_cloud.ply, or the capture that it was trained on",
         )
+    if (path / "map.json").is_file():
+        return InputError("is a map already, as bidnerf writes them", where=path, expected="photos or a dataset")
     children = (child for child in sorted(path.iterdir()) if child.is_dir())
     if (inside := next((child for child in children if find_reader(child, readers)), None)) is not None:
         return InputError("no dataset found", where=path, expected=f"one of the folders in it, such as {inside.name}")

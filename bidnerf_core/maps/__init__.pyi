@@ -34,6 +34,8 @@ from .scene import landmark_cameras as landmark_cameras
 from .scene import move_map_to as move_map_to
 from .scene import origin_of as origin_of
 from .scene import unit_of as unit_of
+from .store import MATCHES as MATCHES
+from .store import MATCHES_STAY as MATCHES_STAY
 from .store import Checkpoints as Checkpoints
 from .store import build_frozen_field as build_frozen_field
 from .store import map_folder as map_folder

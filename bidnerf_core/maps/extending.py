@@ -176,7 +176,8 @@ def _frames(photos: NewPhotos, scene: Map, split: str) -> tuple[list[Frame], lis
     if odd := [type(frame).__name__ for frame in frames if not isinstance(frame, Frame)]:
         raise InputError(f"photos holds a {odd[0]}", expected="frames, views, or a path")
     if not frames and unread:
-        raise InputError(f"none of {amount(len(unread), 'photo')} can be read: {unread[0][1]}")
+        several = f"none of {amount(len(unread), 'photo')} can be read, the first: " if len(unread) > 1 else ""
+        raise InputError(f"{several}{unread[0][1]}")
     if not frames:
         raise InputError("no photos to add", expected="at least one")
     seen = [frame.over(background) for frame in frames]
@@ -262,6 +263,7 @@ def _extend(
             grown = grown.with_parts(None, more if own is None or len(more) else own)
     before, after = (0 if m.landmarks is None else len(m.landmarks) for m in (scene, grown))
     log.info(f"{where}: {before} landmarks before, {after} now; {amount(len(info.cameras), 'image')}")
+    grown = replace(grown, info=replace(grown.info, data=scene.info.data))
     if scene.folder is None:
         return grown
     stored = load_info(scene.folder)
@@ -295,6 +297,7 @@ def _train_further(scene: Map, views: Sequence[View], steps: int | None, share: 
         weights=field.state_dict(),
     )
     info = replace(info, step=info.step + grown.info.step, seconds=grown.info.seconds)
+    info = replace(info, data=scene.name)  # for messages, until the map is complete
     return replace(scene, info=info, field=grown.field, folder=None, record=scene.capture)
 
 

@@ -11,12 +11,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from bidnerf_core.captures import StoredCamera
-from bidnerf_core.datasets import Capture
+from bidnerf_core.datasets import Capture, find_reader
 from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.fields import SceneBounds
 from bidnerf_core.geometry import SE3, Similarity
 from bidnerf_core.io import open_binary, require_existing
 from bidnerf_core.mapping import Keypoints
+from bidnerf_core.maps.description_file import DESCRIPTION
 from bidnerf_core.registry import Plugins, interface_defects
 
 UNMOVED = Similarity(1.0, SE3.identity())
@@ -125,6 +126,12 @@ def importer_of(path: Path, name: str | None = None) -> tuple[str, Importer]:
     if able:
         raise InputError(
             f"{enumeration([each for each, _ in able])} can each read it; choose one of them (`importer`)", where=path
+        )
+    if (path / DESCRIPTION).is_file():
+        raise InputError("is a map already, as bidnerf writes them", where=path, expected="a trained field")
+    if find_reader(path) is not None:
+        raise InputError(
+            "is a dataset", where=path, expected="a trained field; 'bidnerf train' makes a map of a dataset"
         )
     known = "; ".join(f"{each} reads {importer.summary}" for each, importer in found)
     absent = [f"./plugins/bidnerf-{each} for {what}" for each, what in OFFERED.items() if each not in IMPORTERS]

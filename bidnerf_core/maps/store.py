@@ -15,7 +15,7 @@ import os
 import re
 import secrets
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -26,9 +26,9 @@ from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor, nn
 
 from bidnerf_core.backend import UpgradingField, load_backend
-from bidnerf_core.captures import CaptureReport
+from bidnerf_core.captures import CaptureReport, StoredCamera
 from bidnerf_core.errors import InputError, amount, errors_in
-from bidnerf_core.fields import NoField, RadianceField, ScaledField, trained_field
+from bidnerf_core.fields import NoField, RadianceField, ScaledField, SceneBounds, trained_field
 from bidnerf_core.io import (
     from_plain,
     load_part,
@@ -50,6 +50,7 @@ from bidnerf_core.mapping import (
 from bidnerf_core.maps.description import ANCHOR, PART_NAMES, MapInfo, load_info
 from bidnerf_core.maps.description_file import DESCRIPTION
 from bidnerf_core.progress import Progress, current_job, log
+from bidnerf_core.registry import PluginError
 from bidnerf_core.training import TrainingState, TrainingStep
 
 NEEDED = "a safetensors file, without which the map is incomplete; copy its folder again"
@@ -61,6 +62,9 @@ OURS = re.compile(rf"{_NAMES}|\.({_NAMES}|map\.json)\.[0-9a-f]{{8}}")
 
 USUAL_SECONDS = 60.0
 """Time between checkpoints (seconds)."""
+MATCHES = "training-000000000-*.safetensors"
+"""Pattern of the file with the tracks of a training that has not written the description of its map yet."""
+MATCHES_STAY = "the matches of its keypoints are kept, and the same command goes on from there"
 
 
 @dataclass(frozen=True)
@@ -349,6 +353,24 @@ def build_field(info: MapInfo, where: str) -> RadianceField:
     return field
 
 
+def check_backend(backend: str, config: dict[str, Any], where: str) -> None:
+    """Raise ``InputError`` unless a backend builds a field whose values have the right shapes, for some bounds."""
+    bounds = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 6.0)
+    values = build_field(MapInfo(backend, config, bounds, 0, False), where).query(torch.zeros(2, 3), torch.eye(3)[:2])
+    shapes = tuple(values.density.shape), tuple(values.rgb.shape)
+    if shapes != ((2,), (2, 3)):
+        raise PluginError(
+            f"the field of backend {backend!r} returned density and rgb of shapes {shapes[0]} and {shapes[1]} at 2 points",
+            expected="(2,) and (2, 3), see FieldValues",
+        )
+
+
+def matches_file(folder: Path, cameras: Sequence[StoredCamera], features: str) -> Path:
+    """Return the file in which a training keeps the tracks of these images' keypoints until its map has a description."""
+    digest = hashlib.blake2b(repr((cameras, features)).encode(), digest_size=4).hexdigest()
+    return folder / MATCHES.replace("*", digest)
+
+
 def content_digest(field: RadianceField, surface: SurfaceMap | None, landmarks: LandmarkMap | None) -> str:
     """Return a hexadecimal digest of the content of a map: the weights of its field, its surface and its landmarks."""
     trained, hashed = trained_field(field), hashlib.blake2b(digest_size=8)
@@ -361,8 +383,9 @@ def content_digest(field: RadianceField, surface: SurfaceMap | None, landmarks: 
     return hashed.hexdigest()
 
 
-def map_folder(out: Path, overwrite: bool) -> contextlib.AbstractContextManager[None]:
-    """Prepare a folder for a map and hold its lock within the context, see ``output_folder``."""
+@contextlib.contextmanager
+def map_folder(out: Path, overwrite: bool) -> Iterator[None]:
+    """Prepare a folder for a map and hold its lock within the context, see ``output_folder``; an error leaves no matches there."""
 
     def describe(folder: Path) -> str | None:
         try:
@@ -371,13 +394,16 @@ def map_folder(out: Path, overwrite: bool) -> contextlib.AbstractContextManager[
             return None
         return None if stopped is None else f"holds a map, and {stopped}"
 
-    return output_folder(
-        out,
-        overwrite,
-        # A process that was killed before the map was complete leaves files without a description.
-        lambda file: OURS.fullmatch(file.name) is not None and not (out / DESCRIPTION).exists(),
-        describe,
-    )
+    def is_leftover(file: Path) -> bool:  # of a process that was killed before the map had a description
+        return OURS.fullmatch(file.name) is not None and not (out / DESCRIPTION).exists()
+
+    with output_folder(out, overwrite, is_leftover, describe):
+        try:
+            yield
+        except (InputError, OSError):
+            for file in out.glob(MATCHES):
+                file.unlink()
+            raise
 
 
 def _sweep(folder: Path) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import torch
 from jaxtyping import Float
@@ -29,9 +29,9 @@ from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.datasets import HOLD_OUT_EVERY, POSERS, DatasetOptions, SparseChoice, lacks_poses
 from bidnerf_core.devices import move_to, working_device
 from bidnerf_core.errors import Cancelled, InputError, amount, enumeration
-from bidnerf_core.fields import NoField, SceneBounds, device_of, trained_field
+from bidnerf_core.fields import NoField, device_of, trained_field
 from bidnerf_core.frames import View
-from bidnerf_core.io import from_plain, pack_tensors, to_plain
+from bidnerf_core.io import from_plain, pack_tensors, read_tensors, to_plain, write_file
 from bidnerf_core.mapping import (
     USUAL_FEATURES,
     BakeConfig,
@@ -42,19 +42,25 @@ from bidnerf_core.maps.description import MapInfo, load_info, longest_side
 from bidnerf_core.maps.description_file import DESCRIPTION
 from bidnerf_core.maps.map import USUAL_BAKE, Map, load_map
 from bidnerf_core.maps.store import (
+    MATCHES,
+    MATCHES_STAY,
+    NEEDED,
+    STORED_PARTS,
     USUAL_SECONDS,
     Checkpoints,
     build_field,
     build_frozen_field,
+    check_backend,
     load_state,
     map_folder,
+    matches_file,
     read_part,
     write_parts,
 )
 from bidnerf_core.maps.views import ViewSource, choose_origin, read_views, views_again
 from bidnerf_core.progress import Cancel, ProgressCallback, counter, duration_text, job_context, log
 from bidnerf_core.registry import USUAL_BACKEND, USUAL_POSER, PluginError
-from bidnerf_core.settings import NotNegative, Settings
+from bidnerf_core.settings import NotNegative, Settings, WholeNumbers
 from bidnerf_core.training import TrainingState, TrainingStopped
 
 
@@ -98,6 +104,9 @@ class TrainOptions(MapOptions):
 
     point_choice: SparseChoice = SparseChoice()
     """which of these points are used"""
+
+    first: Annotated[int, WholeNumbers(1)] | None = None
+    """how many images of the split are used, from the first one; None: all"""
 
     checkpoint_seconds: NotNegative = USUAL_SECONDS
     """time between checkpoints: the most work lost if the program is killed"""
@@ -153,21 +162,13 @@ def train(
     baking = bake_settings(bake)
     working_device(options.device)  # an invalid one is rejected before anything is read
     folder, known = None if out is None else Path(out), None
-    # So is a field that cannot be built; its bounds are not known yet.
-    bounds = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 6.0)
-    outline = MapInfo(backend, to_plain(settings, "config"), bounds, 0, False)
-    values = build_field(outline, str(folder or "train")).query(torch.zeros(2, 3), torch.eye(3)[:2])
-    shapes = tuple(values.density.shape), tuple(values.rgb.shape)
-    if shapes != ((2,), (2, 3)):
-        raise PluginError(
-            f"the field of backend {backend!r} returned density and rgb of shapes {shapes[0]} and {shapes[1]} at 2 points",
-            expected="(2,) and (2, 3), see FieldValues",
-        )
+    check_backend(backend, to_plain(settings, "config"), str(folder or "train"))
     if folder is not None and not options.overwrite:
         with contextlib.suppress(InputError):
             there = load_info(folder)
             # A map that is complete without a field, such as an imported COLMAP model, gets a field.
             known = there if there.complete and not there.step else None
+    points = options.depth_points, options.point_choice
     with (
         job_context(progress, cancel),
         report_finished_parts(folder),
@@ -177,7 +178,7 @@ def train(
         if known is not None and folder is not None:
             scene = load_map(folder)
             images = replace(images, largest=longest_side(scene.info))
-            read, views = views_again(scene.info, posed, images, options.depth_points, options.point_choice, folder)
+            read, views = views_again(scene.info, posed, images, *points, folder, options.first)
             own = {camera.name for camera in scene.info.cameras}
             if unknown := [view.frame.name for view in read.views if view.frame.name not in own]:
                 raise InputError(
@@ -196,7 +197,7 @@ def train(
                 sparse_depth=read.sparse_depth,
             )
             return _complete(replace(scene, info=info), views, tracked, options, baking)
-        read = read_views(posed, images, options.depth_points, options.point_choice, folder)
+        read = read_views(posed, images, *points, folder, options.first)
         origin = choose_origin(torch.stack([view.T_ref_camera.translation.cpu() for view in read.views]))
         if any(origin):
             log.info(f"{read.where}: the map's own coordinates begin at {origin}, near its cameras")
@@ -206,12 +207,21 @@ def train(
                 f"{read.where}: no measured depth{f' in split {images.split!r}' if read.source else ''}; training on"
                 " colour only"
             )
+        matches = None if folder is None else matches_file(folder, stored_cameras(read.views), options.features)
+
+        def keep_matches(tracked: TrackedViews) -> None:
+            if matches is not None:
+                with contextlib.suppress(OSError):  # they only spare time
+                    write_file(matches, STORED_PARTS["training"].encode(_stored_tracks(tracked)))
+
         taken = prepare_views(
             read.views,
             options.refine_poses,
             features=options.features,
             trust_poses=options.trust_poses,
             depth_unit=read.depth_unit,
+            labels=read_tensors(matches, NEEDED)[TRACKS] if matches is not None and matches.exists() else None,
+            tracks=keep_matches,
         )
         if not taken.distances:
             log.info(
@@ -267,6 +277,8 @@ def report_finished_parts(folder: Path | None) -> Iterator[None]:
         info = None
         with contextlib.suppress(InputError):
             info = None if folder is None else load_info(folder)
+        if info is None and folder is not None and any(folder.glob(MATCHES)):
+            raise Cancelled(f"{folder}: {stopped}; {MATCHES_STAY}") from stopped
         if info is None or isinstance(stopped.__cause__, TrainingStopped):
             raise
         stages = (("landmarks", info.landmarks), ("field", info.step), ("surface", info.surface))
@@ -303,7 +315,8 @@ def resume(
     ):
         info = check_resumable(out, baking is not None)  # another process may have finished meanwhile
         images = replace(images, largest=longest_side(info))
-        read, views = views_again(info, posed, images, options.depth_points, options.point_choice, out)
+        points = options.depth_points, options.point_choice
+        read, views = views_again(info, posed, images, *points, out, options.first)
         if stored_cameras(read.views) != given_cameras(info.cameras):
             raise InputError(
                 f"{f'split {images.split!r} has' if read.source else 'these have'} frames or poses that differ from those"

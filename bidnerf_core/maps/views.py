@@ -116,8 +116,9 @@ def read_views(
     depth_points: str | Path | None = None,
     point_choice: SparseChoice | None = None,
     folder: Path | None = None,
+    first: int | None = None,
 ) -> ReadViews:
-    """Read the views of ``data``; for a dataset, ``options.split`` selects the split, or "all" for all splits.
+    """Read the ``first`` so many views of ``data``, or all; of a dataset, ``options.split`` selects the split, or "all" for all splits.
 
     Dataset images with more than ``options.largest`` pixels along the longer side are downscaled to that size,
     by default to ``useful_size``. Images are held as bytes and, if there are many, in an unnamed file in
@@ -135,7 +136,7 @@ def read_views(
     if isinstance(data, Capture):
         if background is not None and background_colour(background) != data.background:
             raise InputError(f"was opened with background {data.background}, got {background!r}", where=data.path)
-        read = _read_dataset(data, split, largest, folder)
+        read = _read_dataset(data, split, first, largest, folder)
     else:
         given: Sequence[object] = data if isinstance(data, Sequence) else [data]
         views = [view for view in given if isinstance(view, View)]
@@ -144,7 +145,7 @@ def read_views(
         if not views:
             raise InputError("data holds no views", expected="at least one")
         colour = BLACK if background is None else background_colour(background)
-        views = [view.over(colour) for view in views]
+        views = [view.over(colour) for view in views[:first]]
         read = ReadViews(views, "", "views in memory", colour, unit=_unit_of(views))
     hidden = [view.frame.hidden for view in read.views]
     if (sentence := masks_sentence(hidden)) is not None:
@@ -155,9 +156,9 @@ def read_views(
     return _with_depth(read, Path(depth_points), point_choice or SparseChoice(), split)
 
 
-def _read_dataset(data: Capture, split: str, largest: int | None, folder: Path | None) -> ReadViews:
+def _read_dataset(data: Capture, split: str, first: int | None, largest: int | None, folder: Path | None) -> ReadViews:
     """Read the views of a split one after another, so that only one image at a time is in memory at full size."""
-    where, shots = str(data.path), data.select(split)
+    where, shots = str(data.path), data.select(split)[:first]
     if not shots:
         raise InputError(f"split {split!r} has no frames", where=where)
     views = list[View]()
@@ -258,6 +259,7 @@ def views_again(
     depth_points: str | Path | None = None,
     point_choice: SparseChoice | None = None,
     folder: Path | None = None,
+    first: int | None = None,
 ) -> tuple[ReadViews, list[View]]:
     """Read images of the map that ``info`` describes, as ``read_views`` does, with poses relative to the map's origin.
 
@@ -267,7 +269,7 @@ def views_again(
     """
     if options.background is None and isinstance(data, str | Path) and info.backend:
         options = replace(options, background=info.bounds.background)
-    read = read_views(data, options, depth_points, point_choice, folder)
+    read = read_views(data, options, depth_points, point_choice, folder, first)
     poses = {camera.name: camera.pose for camera in info.cameras}
     pairs = [(view.T_ref_camera, poses[view.frame.name]) for view in read.views if view.frame.name in poses]
     if pairs and info.field_frame is not None:

@@ -548,7 +548,9 @@ def test_another_signal_says_what_is_kept_and_how_to_go_on(
     monkeypatch.setattr("bidnerf_core.maps.training.bake_if_possible", stop)
     monkeypatch.setattr("bidnerf.scenes.views", stop, raising=False)
     monkeypatch.setattr("bidnerf_core.maps.training.read_views", stop)
-    demo, new = tmp_path / "demo", tmp_path / "new"
+    demo, new, matched = tmp_path / "demo", tmp_path / "new", tmp_path / "matched"
+    matched.mkdir()
+    (matched / "training-000000000-0123abcd.safetensors").touch()
     for command, line in (
         (
             ["train", data, "--out", interrupted, "--finish"],
@@ -562,6 +564,10 @@ def test_another_signal_says_what_is_kept_and_how_to_go_on(
         (
             ["train", data, "--out", new],
             f"{new}: stopped before anything of the map was saved; the same command starts again",
+        ),
+        (
+            ["train", data, "--out", matched],
+            f"{matched}: stopped; the matches of its keypoints are kept, and the same command goes on from there",
         ),
     ):
         stopped = bidnerf(*command)

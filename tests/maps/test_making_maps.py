@@ -67,6 +67,13 @@ def whole() -> bn.Map:
     return trained()
 
 
+def test_the_first_images_are_trained_on(tmp_path: Path) -> None:
+    data = tiny.write_dataset(tmp_path / "data")
+    for source, options in ((tiny.views(), OPTIONS), (data, bn.TrainOptions())):
+        scene = bn.train(source, config=tiny.config(1), bake=False, options=replace(options, first=3))
+        assert len(scene.info.cameras) == 3
+
+
 def test_a_map_in_memory_answers_as_the_one_that_is_saved_and_loaded(scene: bn.Map, tmp_path: Path) -> None:
     assert scene.folder is None
     assert scene.surface is not None
@@ -155,6 +162,20 @@ def test_what_was_finished_is_kept_when_a_stage_is_cancelled_and_finish_ends_it(
     assert torch.equal(require(done.landmarks).positions, require(half.landmarks).positions)
     with refused(found="nothing to resume"):
         bn.resume(out, views)
+
+
+def test_matches_are_kept_when_the_poses_are_not_refined_yet(tmp_path: Path) -> None:
+    views, progress = [replace(v, frame=v.frame.replace(depth=None)) for v in training_views()], list[Progress]()
+    stop = stopping_at("finding the bounds of the scene")
+    with pytest.raises(
+        bn.Cancelled, match=r"matches of its keypoints are kept, and the same command goes on from there"
+    ):
+        bn.train(views, out=tmp_path / "map", config=tiny.config(2), bake=BAKE, **stop)
+    scene = bn.train(views, out=tmp_path / "map", config=tiny.config(2), bake=BAKE, progress=progress.append)
+    assert [now for now in progress if now.stage == "landmarks" and now.total > len(views)] == []
+    at_once = bn.train(views, config=tiny.config(2), bake=BAKE)
+    assert torch.equal(require(scene.landmarks).positions, require(at_once.landmarks).positions)
+    assert len(list((tmp_path / "map").glob("training-*"))) == 0
 
 
 def test_quick_training_takes_the_backends_quick_settings(tmp_path: Path) -> None:

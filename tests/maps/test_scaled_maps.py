@@ -214,7 +214,7 @@ def test_a_map_that_is_being_changed_is_not_read(bidnerf: Run, tmp_path: Path, m
         return read(folder)
 
     monkeypatch.setattr("bidnerf_core.maps.load_map", load)
-    assert bidnerf("scale", tmp_path / "map", "--factor", "2")[0] == 0
+    assert bidnerf("scale", tmp_path / "map", "--factor", "2", "--overwrite")[0] == 0
     monkeypatch.setattr("bidnerf_core.maps.extending.load_map", load)
     bidnerf("extend", tmp_path / "map", tmp_path)
     assert len(refused) == 2
@@ -240,6 +240,12 @@ def test_the_command(bidnerf: Run, tmp_path: Path) -> None:
     view = before.info.cameras[0]
     assert view.pose.translation.tolist() == pytest.approx(back.info.cameras[0].pose.translation.tolist())
     assert bidnerf("scale", tmp_path / "half")[0] == 2
+    metric = replace(before, info=replace(before.info, unit="metres")).save(tmp_path / "metric")
+    again = "scale", metric.folder, "--factor", 2
+    assert_refused(
+        bidnerf(*again), 1, metric.folder, "is in metres by its data", "multiplied by 2", "--out", "--overwrite"
+    )
+    bidnerf(*again, "--overwrite").succeed()
     assert_refused(
         bidnerf("scale", trained, "--factor", 2, "--out", tmp_path / "half"), 1, "exists already", "--overwrite"
     )

@@ -279,7 +279,7 @@ def unwritable(folder: Path) -> Checks:
         "train over a map": ["train", data, "--out", work / "map", "--overwrite", *training],
         "resume": ["train", data, "--out", work / "map", "--resume"],
         "bake": ["bake", work / "map", "--data", data, *BAKED],
-        "scale": ["scale", work / "map", "--factor", "2"],
+        "scale": ["scale", work / "map", "--factor", "2", "--overwrite"],
         "localize --out": [*known, "--out", work / "p.json"],
         "localize --out over a file": [*known, "--out", work / "poses.json"],
         "localize --draw": [*known, "--draw", work / "pictures"],
