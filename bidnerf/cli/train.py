@@ -111,7 +111,7 @@ class TrainingOptions:
     backend: Annotated[
         str | None, installed("backends"), Option("NAME", "kind of field, one of 'bidnerf backends'", USUAL_BACKEND)
     ] = None
-    first: First = None
+    first: Annotated[First, EXPERT] = None
     quick: Annotated[Flag, Option(None, "train briefly, with the backend's settings for a first map")] = False
     resume: Annotated[Flag, Option(None, "continue the interrupted training in --out")] = False
     finish: Annotated[Flag, Option(None, "end the interrupted training in --out now, with the steps done so far")] = (
