@@ -116,7 +116,7 @@ MethodName: TypeAlias = Annotated[
 DaskAddress: TypeAlias = Annotated[
     str | None,
     EXPERT,
-    Option("ADDRESS", "address of a dask scheduler whose workers detect and match keypoints"),
+    Option("ADDRESS", "address of a dask scheduler whose workers detect and match keypoints, and train cells"),
 ]
 Overwrite: TypeAlias = Annotated[bool, FLAG, Option(None, "replace output that exists")]
 

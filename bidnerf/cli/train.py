@@ -46,8 +46,8 @@ PoserName: TypeAlias = Annotated[
 ]
 
 
-def keypoint_workers(dask: str | None) -> AbstractContextManager[None]:
-    """Return a context in which the workers of the dask scheduler at this address, if any, detect and match keypoints."""
+def workers_of(dask: str | None) -> AbstractContextManager[None]:
+    """Return a context in which the workers of the dask scheduler at this address, if any, do the tasks."""
     from bidnerf.evaluation import cluster
 
     return contextlib.nullcontext() if dask is None else cluster(dask)
@@ -86,7 +86,7 @@ def run_poses(
     from bidnerf_core.io import to_plain
 
     given = camera if photos_camera == CameraOptions() else photos_camera.source(camera)
-    with keypoint_workers(dask), interruptible_work("stopping (Ctrl-C again: at once); what was found is kept"):
+    with workers_of(dask), interruptible_work("stopping (Ctrl-C again: at once); what was found is kept"):
         poses = POSERS.load(poser)(photos, out, given, overwrite)
     print_result(to_plain(poses), (), json)
 
@@ -249,7 +249,7 @@ def run_train(
         )
 
     with (
-        keypoint_workers(training.dask),
+        workers_of(training.dask),
         report_time(f"{out}: trained and baked" if bake else f"{out}: trained"),
         interruptible_work(
             "stopping after this step (Ctrl-C again: at once, back to the last checkpoint)", at_once=saved

@@ -290,7 +290,9 @@ def executor_of(workers: Workers, trials: int, on_cpu: bool) -> Iterator[tuple[E
 
 @contextmanager
 def cluster(workers: Workers) -> Iterator[None]:
-    """Let ``train`` and ``find_poses`` detect and match keypoints in other processes within the block; the results are the same.
+    """Let ``train`` and ``find_poses`` work in other processes within the block; the results are the same.
+
+    These detect and match keypoints, and train the cells of the backend ``cells``.
 
     ``workers`` is a number of local processes (None: one per core), or the address of a dask scheduler, which repeats the tasks of a
     worker that is lost. Raises ``InputError`` as ``evaluate`` does.
