@@ -22,7 +22,15 @@ SHAPES = "BIDNERF_SHAPES"
 if os.environ.get(SHAPES) == "1":
     # Before the first import of the project: only modules that are imported afterwards are checked.
     install_import_hook(
-        ["bidnerf", "bidnerf_core", "bidnerf_adanerf", "bidnerf_bid", "bidnerf_cells", "bidnerf_hashgrid", "bidnerf_vanilla"],
+        [
+            "bidnerf",
+            "bidnerf_core",
+            "bidnerf_adanerf",
+            "bidnerf_bid",
+            "bidnerf_cells",
+            "bidnerf_hashgrid",
+            "bidnerf_vanilla",
+        ],
         "shape_checks.checked",
     )
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 import bidnerf as bn
 import tiny
 from bidnerf.scenes import GaussianBlobs
-from bidnerf.testing import SCENE_BOUNDS, BackendContract, awkward_rays, rgbd_views
+from bidnerf.testing import SCENE_BOUNDS, BackendContract, Recorder, awkward_rays, rgbd_views
 from bidnerf_cells import CellsConfig, CellsField, backend
 from bidnerf_cells.field import CellGrid
 from bidnerf_cells.photos import of_mean_exposure, surface_depth, view_of_cell
@@ -22,9 +22,8 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields import FieldValues, SceneBounds, Stratified, render
 from bidnerf_core.frames import Frame, SeenLandmarks, View
 from bidnerf_core.geometry import SE3
-from bidnerf_core.progress import job_context
 from bidnerf_core.registry import registered
-from bidnerf_core.training import ColourTransforms
+from bidnerf_core.training import ColourTransforms, TrainingStopped
 from simulated_device import StaysOnDevice
 
 INNER = (
@@ -272,13 +271,9 @@ def test_steps_are_divided_among_the_overview_and_the_cells(tmp_path: Path) -> N
     assert field.trained.all()
 
 
-def small_map(folder: Path | None = None, **changes: Any) -> bn.Map:
-    config = {"inner_settings": list(INNER), "steps": 45, "overview_share": 0.2}
-    return bn.train(tiny.views(), "cells", folder, config, bake=False, **changes)
-
-
 def test_a_map_of_cells_is_stored_and_scaled(tmp_path: Path) -> None:
-    scene = small_map(tmp_path / "map")
+    config = {"inner_settings": list(INNER), "steps": 20, "overview_share": 0.2}
+    scene = bn.train(tiny.views(), "cells", tmp_path / "map", config, bake=False)
     view = tiny.views()[0]
     before, after = scene.render(view), bn.load_map(tmp_path / "map").render(view)
     assert torch.equal(before.rgb, after.rgb)
@@ -288,20 +283,24 @@ def test_a_map_of_cells_is_stored_and_scaled(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_cells_are_the_same_trained_in_other_processes_and_after_an_interruption(tmp_path: Path) -> None:
-    expected: Any = small_map().field
-    with bn.cluster(2), job_context():
-        found: Any = small_map().field
-        steps = list[int]()
+def test_cells_are_the_same_trained_in_other_processes_and_after_an_interruption() -> None:
+    config = CellsConfig(inner_settings=INNER, steps=18, overview_share=0.2)
 
-        def stop_after_some(progress: Any) -> None:
-            steps.append(progress.done)
+    def train(report: Recorder) -> CellsField:
+        field = backend.build(config, SCENE_BOUNDS)
+        backend.train(field, rgbd_views(), config, report)
+        return field
 
-        with pytest.raises(bn.Cancelled, match="saved after step"):
-            small_map(tmp_path / "map", progress=stop_after_some, cancel=lambda: bool(steps) and steps[-1] >= 20)
-        kept: Any = bn.load_map(tmp_path / "map").field
-        assert 0 < int(kept.trained.sum()) < len(kept.trained)
-        resumed: Any = bn.resume(tmp_path / "map", tiny.views(), bake=False).field
-    for field in (found, resumed):
-        for name, value in expected.state_dict().items():
-            assert torch.equal(field.state_dict()[name], value), name
+    fields, stopped = [train(Recorder())], Recorder(stop=10)
+    with bn.cluster(2):
+        fields.append(train(Recorder()))
+        with pytest.raises(TrainingStopped) as stop:
+            train(stopped)
+        (state,) = stopped.saved
+        assert state.step == stop.value.step == config.ends(8)[4]  # the cell that was in work is finished
+        assert state.field["trained"].sum() == 4
+        fields.append(train(Recorder(state=state)))
+    first, *others = (field.state_dict() for field in fields)
+    for other in others:
+        for name, value in first.items():
+            assert torch.equal(other[name], value), name
