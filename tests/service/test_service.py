@@ -44,14 +44,14 @@ pytest.importorskip("uvicorn", reason="the extra 'serve' is not installed")
 from starlette.responses import PlainTextResponse
 
 from bidnerf import InputError, ServiceClient, ServiceError, open_dataset, serve
-from bidnerf.service import Application, ServiceLimits, public_message, run_app, service_app
+from bidnerf.service import Application, ServiceLimits, Upload, public_message, read_upload, run_app, service_app
 
 # Inside: workers are killed, and the description is compared with the parameters that are read
 from bidnerf.service.models import LocalizationBody, MapFacts, PhotoForm
 from bidnerf.service.pool import Pool
 from bidnerf.service.server import maps_by_name
 from bidnerf.service.web import SAFE, Gate
-from bidnerf_core.camera import WAYS
+from bidnerf_core.camera import WAYS, CameraSource
 from bidnerf_core.localization import settings_of
 from bidnerf_core.registry import _declared
 from bombs import png_of
@@ -575,6 +575,13 @@ def test_every_path_is_described(service: Service) -> None:
     for facts in maps.values():
         MapFacts.model_validate(facts)
     assert service.get("/maps/hall").json["anchor"]["latitude"] == 47.4
+
+
+def test_the_name_of_a_photo_in_place_of_its_content_is_told(tmp_path: Path) -> None:
+    for content, expected in ((b"photo.png", "'curl -F photo=@FILE' sends it"), (b"\x89PNG", "a complete image file")):
+        with pytest.raises(InputError, match="not readable as an image") as refused:
+            read_upload(Upload({}, {"photo": content}), CameraSource(), tmp_path, 1e6)
+        assert expected in str(refused.value)
 
 
 def test_the_client_asks_a_server(inputs: Inputs, service: Service) -> None:
