@@ -20,6 +20,7 @@ from bidnerf.cli.options import (
     NewPhotoCamera,
     Overwrite,
     PointChoice,
+    StartFile,
     existing,
     installed,
     refuse,
@@ -35,6 +36,8 @@ from bidnerf_core.registry import USUAL_BACKEND, USUAL_FEATURES, USUAL_POSER
 from bidnerf_core.settings import EXPERT, Range
 
 if TYPE_CHECKING:
+    from bidnerf_core.camera import CameraSource
+    from bidnerf_core.datasets import PosedPhotos
     from bidnerf_core.maps import MapInfo
 
 
@@ -53,6 +56,34 @@ def workers_of(dask: str | None) -> AbstractContextManager[None]:
     return contextlib.nullcontext() if dask is None else cluster(dask)
 
 
+@dataclass(frozen=True)
+class SearchOptions:
+    """How the poses of photos are found."""
+
+    poser: PoserName = USUAL_POSER
+    dask: DaskAddress = None
+    known: Annotated[
+        StartFile,
+        EXPERT,
+        Option(
+            "POSES.json", "rough T_world_camera of some photos by name, in any world, which tell what photos to compare"
+        ),
+    ] = None
+
+    def find(self, photos: Path, out: Path, camera: CameraSource | Path | None, overwrite: bool) -> PosedPhotos:
+        """Find the poses. Raises ``UsageError`` if the poser takes no known ones."""
+        from bidnerf.results import read_poses
+        from bidnerf_core.datasets import POSERS
+
+        if self.known is None:
+            return POSERS.load(self.poser)(photos, out, camera, overwrite)
+        if self.poser != USUAL_POSER:
+            raise UsageError(f"--known is for the poser {USUAL_POSER}, but --poser is {self.poser}")
+        from bidnerf.structure import find_poses
+
+        return find_poses(photos, out, camera, overwrite, known=read_poses(self.known))
+
+
 def run_poses(
     photos: Annotated[
         Path,
@@ -69,12 +100,11 @@ def run_poses(
         ),
         existing("a file with the intrinsics"),
     ] = None,
-    poser: PoserName = USUAL_POSER,
-    dask: DaskAddress = None,
     overwrite: Overwrite = False,
     json: Json = False,
     *,
     photos_camera: NewPhotoCamera,
+    search: Annotated[SearchOptions, Group("search", "How the poses are found.")],
 ) -> None:
     """Find the poses of photos by structure from motion.
 
@@ -82,12 +112,11 @@ def run_poses(
     arbitrary. Ctrl-C stops, and the same command resumes. 'bidnerf train PHOTOS' performs this step first.
     """
     check_folder(out, (photos,))
-    from bidnerf_core.datasets import POSERS
     from bidnerf_core.io import to_plain
 
     given = camera if photos_camera == CameraOptions() else photos_camera.source(camera)
-    with workers_of(dask), interruptible_work("stopping (Ctrl-C again: at once); what was found is kept"):
-        poses = POSERS.load(poser)(photos, out, given, overwrite)
+    with workers_of(search.dask), interruptible_work("stopping (Ctrl-C again: at once); what was found is kept"):
+        poses = search.find(photos, out, given, overwrite)
     print_result(to_plain(poses), (), json)
 
 

@@ -194,7 +194,7 @@ OPTIONS = """
 --out --seed --split --frame --size --trials --workers --images --angle --fault --device --protocol --method
 --steps --levels --log2-table-size --width --learning-rate --cells --rays --max-steps --hypotheses --start --perturb --window
 --depth --depth-unit --depth-points --camera --focal --hfov --draw --json --level --overwrite --resume --background --backend
---dask --criterion --title --no-depth --split= --plot --help --help-all --nothing
+--dask --known --criterion --title --no-depth --split= --plot --help --help-all --nothing
 """.split()  # noqa: SIM905
 VALUES = (
     *TEXTS,

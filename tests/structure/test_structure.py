@@ -27,6 +27,7 @@ from PIL import Image
 
 import bidnerf as bn
 import tiny
+from bidnerf.cli.train import SearchOptions
 from bidnerf.results import pose_error
 from bidnerf.structure import FoundPoses
 from bidnerf.structure.colmap import list_photos, to_colmap
@@ -46,12 +47,13 @@ from bidnerf.structure.sources import (
 from bidnerf.testing import PoserContract
 from bidnerf_core.camera import CentralLens
 from bidnerf_core.datasets import Capture, Shot, lacks_poses
+from bidnerf_core.errors import UsageError
 from bidnerf_core.geometry import fit_similarity, look_at
 
 # Inside: each stage of the search for poses, with its rare geometry
 from bidnerf_core.maps.training import open_posed_images, poses_folder
 from bidnerf_core.progress import Progress, job_context
-from commands import Run
+from commands import Run, assert_refused
 from optional import require
 from photo_files import write_photo
 from photo_room import CAMERA, photograph, room_depth, walk, write_photos
@@ -259,7 +261,7 @@ def test_the_model_is_beside_the_dataset(search: Search) -> None:
     assert len(points.ids) == search.found.points
 
 
-def test_poses_that_were_found_are_not_sought_again(search: Search, tmp_path: Path) -> None:
+def test_poses_that_were_found_are_not_sought_again(search: Search, tmp_path: Path, bidnerf: Run) -> None:
     stages = list[str]()
     again = bn.find_poses(search.photos, search.out, progress=lambda now: stages.append(now.stage))
     assert again == search.found
@@ -273,6 +275,12 @@ def test_poses_that_were_found_are_not_sought_again(search: Search, tmp_path: Pa
         bn.find_poses(search.photos, search.out, known={name: bn.SE3.identity()})
     with refused(where=search.photos, found="known has none of the"):
         bn.find_poses(search.photos, search.out, known={f"{name}.png": bn.SE3.identity()})
+    known = tmp_path / "known.json"
+    known.write_text(json.dumps([{"frame": "elsewhere", "T_world_camera": torch.eye(4).tolist()}]))
+    ran = bidnerf("poses", search.photos, "--out", search.out, "--known", known)
+    assert_refused(ran, 1, "known has none of the")
+    with pytest.raises(UsageError, match="for the poser colmap, but --poser is other"):
+        SearchOptions("other", known=known).find(search.photos, search.out, None, False)
 
 
 def test_train_takes_photos_without_poses(search: Search, bidnerf: Run, caplog: pytest.LogCaptureFixture) -> None:
