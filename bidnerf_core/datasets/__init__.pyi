@@ -57,6 +57,7 @@ from .trajectories import read_table as read_table
 from .trajectories import read_timed_files as read_timed_files
 from .trajectories import read_trajectory as read_trajectory
 from .unposed import POSERS as POSERS
+from .unposed import PosedPhotos as PosedPhotos
 from .unposed import Poser as Poser
 from .unposed import lacks_poses as lacks_poses
 from .unposed import photos_below as photos_below
