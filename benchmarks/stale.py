@@ -40,6 +40,7 @@ SHARED = tuple(f"bidnerf_core/localization/{part}" for part in ("methods.py", "p
 DESCENT = (*IMAGES, *SHARED, "backends/bidnerf_bid", HASHGRID)
 MEASURED: Mapping[str, Sequence[str]] = {
     "quick_maps|standard_": TRAINING,
+    "fields_by_cell": (*TRAINING, "backends/bidnerf_cells"),
     "tracking": (*LOCALIZATION, "bidnerf_core/maps/tracker.py"),
     "bid_|inerf_|table": DESCENT,
     "faults_": (*LOCALIZATION, "bidnerf/evaluation/faults"),
