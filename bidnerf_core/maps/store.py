@@ -136,6 +136,8 @@ def write_parts(
         "training": None if state is None or info.complete else state.optimizer,
     }
     contents = {part: content for part, content in given.items() if content is not None}
+    if state is not None and info.complete:
+        _drop_matches(folder)  # the disk may have no place for both
     names: dict[str, Any] = {
         part: f"{part}-{info.step:08d}-{secrets.token_hex(4)}.{STORED_PARTS[part].ending}" for part in contents
     }
@@ -401,9 +403,14 @@ def map_folder(out: Path, overwrite: bool) -> Iterator[None]:
         try:
             yield
         except (InputError, OSError):
-            for file in out.glob(MATCHES):
-                file.unlink()
+            _drop_matches(out)
             raise
+
+
+def _drop_matches(folder: Path) -> None:
+    """Remove the tracks of a training that needs them no more."""
+    for file in folder.glob(MATCHES):
+        file.unlink()
 
 
 def _sweep(folder: Path) -> None:
