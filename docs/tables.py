@@ -349,7 +349,7 @@ def headline(records: Records) -> str:
     wrong, times = every["silent"], [cell["median_s"] for _, _, cell in cells]
     text = (
         f"Without a start, it localizes {rgb['right']} of {rgb['n']} held-out RGB images of {scenes['RGB']} scenes and"
-        f" {rgbd['right']} of {rgbd['n']} RGB-D images of {scenes['RGB-D']} scenes to within 5 degrees and 0.05 units. It accepts"
+        f" {rgbd['right']} of {rgbd['n']} RGB-D images of {scenes['RGB-D']} scenes to within 5 degrees and 0.05 metres (or the unit of the map). It accepts"
         f" {every['accepted']} of these poses, of which {wrong or 'none'} {'is' if wrong < 2 else 'are'} wrong. An image takes"
         f" {min(times):.1f} to {max(times):.1f} seconds of CPU time (median of a scene)."
     )
