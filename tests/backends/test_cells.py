@@ -204,7 +204,7 @@ def photo(depth: float, **changes: Any) -> View:
 
 
 def test_a_cell_sees_its_surfaces_and_through_it_and_nothing_behind_other_surfaces() -> None:
-    """Of three cells along x, the wall's left half is in the first, and its right half in the second."""
+    """The left half of the wall lies in the first of three cells along x, and its right half in the second."""
     grid = CellGrid(BOX, (3, 1, 1), 0.1)
     pixels = torch.tensor([[1.0, 1.0], [6.0, 1.0]])
     view = replace(photo(1.5), landmarks=SeenLandmarks(pixels, torch.tensor([1.5, 3.0]), torch.ones(2)))
